@@ -30,10 +30,7 @@ ERROR_MAP_SOFTWARE = f"{SOFTWARE} compare"
 
 
 def scores(image: Array, reference: Array) -> dict[str, float]:
-    """Measure an image by all metrics of :mod:`oiio_msspl.image.metrics`.
-
-    Args:
-        image, reference: scene linear, (height, width, 3).
+    """Measure an image, scene linear (height, width, 3), by all metrics of :mod:`oiio_msspl.image.metrics`.
 
     Returns:
         ``psnr`` in dB, ``relmse`` with the constants 0.5 and 0.01, ``relmse_gharbi`` with 1 and 1e-4, and ``ssim``.
@@ -141,9 +138,8 @@ def note_on_spaces(comparison: Comparison) -> str:
 def note_on_views(comparison: Comparison) -> str:
     """Say that a file lacks the view, or view layer, of the first image; empty if all have it or none has several."""
     renders = comparison.renders
-    view = renders[0].view
-    same = all(view in (render.view, *render.view.split("/")) for render in renders)
-    if same or not any(render.other_views for render in renders):
+    is_in_all = all(renders[0].view in (render.view, *render.view.split("/")) for render in renders)
+    if is_in_all or not any(render.other_views for render in renders):
         return ""
     return f"Different views are compared: {', '.join(f'{name_of(r.view)} of {r.name}' for r in renders)}"
 
@@ -189,10 +185,6 @@ def common_windows(renders: Sequence[MappedRender], largest: MappedRender) -> li
     their display windows differ by a scale of ``SCALES``. Otherwise a render shows the data window of ``largest``, at
     its size or smaller by such a scale.
 
-    Args:
-        renders: the renders to compare.
-        largest: the render at whose size all are compared.
-
     Raises:
         InputError: a size does not fit, or renders have no part in common.
     """
@@ -221,12 +213,10 @@ def _place(render: MappedRender, largest: MappedRender) -> _Place:
     data, display, whole, frame = render.data_window, render.display_window, largest.data_window, largest.display_window
     if display == frame:
         return _Place(1, 0, 0, data)
-    scale = _scale(display, frame)
-    if scale and (data != display or whole != frame):
+    if (scale := _scale(display, frame)) and (data != display or whole != frame):
         x0, y0 = frame.x0 - scale * display.x0, frame.y0 - scale * display.y0
         return _Place(scale, x0, y0, Window(*(scale * side for side in astuple(data))).shift(x0, y0))
-    scale = _scale(data, whole)
-    if scale:
+    if scale := _scale(data, whole):
         return _Place(scale, whole.x0 - scale * data.x0, whole.y0 - scale * data.y0, whole)
     raise InputError(f"{render.name} is {data.size}, but {largest.name} is {whole.size}; compare pictures of one size")
 
@@ -239,12 +229,7 @@ def _scale(window: Window, larger: Window) -> int | None:
 
 
 def check_error_map(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None:
-    """Check that an error map of the files ``compared`` can be written at ``path``.
-
-    Raises:
-        InputError: ``path`` does not end with .png, is one of the files compared, exists and may not be overwritten, or
-            lies in a folder that is missing or read-only.
-    """
+    """Raise InputError if no map of the files ``compared`` can be written at ``path``, which must end with .png."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the error map is a PNG; name it .png")
     check_target(path, overwrite=overwrite)
@@ -253,11 +238,6 @@ def check_error_map(path: Path, compared: Sequence[Path], *, overwrite: bool) ->
 
 def write_error_map(path: Path, comparison: Comparison, *, overwrite: bool) -> None:
     """Write the :func:`error_map` of the first image as a PNG.
-
-    Args:
-        path: the PNG to write.
-        comparison: the image and its reference.
-        overwrite: replace an existing file.
 
     Raises:
         InputError: pixels can't be read, or ``path`` exists.
@@ -273,13 +253,9 @@ def error_map(image: Array, truth: Array) -> Array:
 
 
 def error_levels(image: Array, truth: Array) -> Array:
-    """Return log10 of every pixel's RelMSE (0.5, 0.01), scaled to [0, 1].
+    """Return log10 of every pixel's RelMSE (0.5, 0.01), scaled to [0, 1]: 0 for 1e-5 or less, 1 for 1 or more.
 
-    Args:
-        image, truth: scene linear, (height, width, 3).
-
-    Returns:
-        (height, width) in [0, 1]: 0 is an error of 1e-5 or less, 1 an error of 1 or more.
+    ``image`` and ``truth`` are scene linear, (height, width, 3).
     """
     error = relmse_map(image, truth).mean(axis=-1)
     return ((np.log10(np.maximum(error, 1e-5)) + 5) / 5).clip(0, 1).astype(np.float32)

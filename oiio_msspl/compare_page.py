@@ -109,12 +109,7 @@ class _Picture:
 
 
 def check_page(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None:
-    """Check that a page of the files ``compared`` can be written at ``path``.
-
-    Raises:
-        InputError: ``path`` does not end with .html, is one of the files compared, exists and may not be overwritten,
-            or lies in a folder that is missing or read-only.
-    """
+    """Raise InputError if no page of the files ``compared`` can be written at ``path``, which must end with .html."""
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: the page is HTML; name it .html")
     check_target(path, overwrite=overwrite)
@@ -122,11 +117,7 @@ def check_page(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None
 
 
 def check_layers(comparison: Comparison, layers: Sequence[str]) -> None:
-    """Check by the headers alone that :func:`write_page` finds the layers.
-
-    Raises:
-        InputError: no file has a layer of a pattern.
-    """
+    """Raise InputError if no file has a layer of a pattern, by the headers alone."""
     _chosen(list(map(_picture, comparison.renders, comparison.windows)), layers)
 
 
@@ -173,14 +164,13 @@ def write_page(
 
 
 def _picture(render: MappedRender, window: Window) -> _Picture:
-    """Find the layers of a file."""
     beauty = render.features[RGB]
     layers = {BEAUTY: _Layer(BEAUTY, beauty, True, stored=beauty.text)}
     shown = set(beauty.terms)
     for additive in render.additive_sets:
         for light in additive.layers:
-            name = f"{light.name} x colour" if light.factor else light.name
-            layers.setdefault(same_spelling(name), _Layer(name, light.formula, True, additive.name, light.name))
+            layer = _Layer(light.label, light.formula, True, additive.name, light.name)
+            layers.setdefault(same_spelling(light.label), layer)
             shown.add(light.channels)
     views = render.view.split("/")
     for stored in layers_of(render.file):
@@ -239,11 +229,11 @@ def _write_layer(
     errors: dict[int, Any] = {}
     for place, picture in holders:
         values = picture.read(key)
-        if not picture.layers[key].is_colour:
-            value_range = value_range or _range_of(values)
-            shown = np.nan_to_num((values - value_range[0]) / (value_range[1] - value_range[0]))
-        else:
+        if picture.layers[key].is_colour:
             shown = _to_rec709(values, picture, pictures)
+        else:
+            black, white = value_range = value_range or _range_of(values)
+            shown = np.nan_to_num((values - black) / (white - black))
         images[place] = _write_codes(out, f"image-{index}-{place}", to_codes(shown))
         if truth is not None and reference is not None and picture is not reference and picture.layers[key].is_colour:
             image = upsampled_like(in_space_of(values, picture.render, reference.render), truth)
@@ -274,16 +264,10 @@ def _to_rec709(values: Array, picture: _Picture, pictures: Sequence[_Picture]) -
 def to_codes(values: Array) -> Codes:
     """Encode light, see the head of this module. Negative values and NaN become 0, infinities the largest half.
 
-    The error of ``from_codes(to_codes(x))`` is at most 0.55 % of ``x + 2**-12``.
+    The light that a code stands for is off by at most 0.55 % of ``x + 2**-12``.
     """
     stops = np.log2(repair(values)[0] + np.float32(2**-STOPS_BELOW_ONE)) + STOPS_BELOW_ONE
     return np.round(CODES_PER_STOP * stops).astype(np.int16)
-
-
-def from_codes(codes: Codes) -> Array:
-    """Decode codes to light."""
-    stops = codes.astype(np.float64) / CODES_PER_STOP - STOPS_BELOW_ONE
-    return (np.exp2(stops) - 2.0**-STOPS_BELOW_ONE).astype(np.float32)
 
 
 def pack(codes: Codes) -> tuple[bytes, bool]:
@@ -319,6 +303,8 @@ def _manifest(
 ) -> dict[str, Any]:
     """Describe the pictures and layers for the page's script."""
     colours = error_colours(np.linspace(0, 1, ERROR_LEVELS, dtype=np.float32)[None])[0]
+    paths = [picture.render.file.path for picture in pictures]
+    names = [path.name for path in paths]
     return {
         "height": largest.window.height,
         "width": largest.window.width,
@@ -326,13 +312,7 @@ def _manifest(
         "codesPerStop": CODES_PER_STOP,
         "stopsBelowOne": STOPS_BELOW_ONE,
         "errorColours": np.round(colours * 255).astype(int).tolist(),
-        "pictures": _labels([picture.render.file.path for picture in pictures]),
+        "pictures": [path.name if names.count(path.name) == 1 else str(path) for path in paths],
         "reference": len(pictures) - 1 if has_reference else None,
         "layers": list(layers),
     }
-
-
-def _labels(paths: Sequence[Path]) -> list[str]:
-    """Return the names of files, or their paths if two files have one name."""
-    names = [path.name for path in paths]
-    return [path.name if names.count(path.name) == 1 else str(path) for path in paths]

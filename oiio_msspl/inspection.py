@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,12 +72,8 @@ class Inspection:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the inspection as JSON values."""
-        result: dict[str, Any] = {
-            "file": str(self.path),
-            "usable": not self.problems,
-            "problems": self.problems,
-            "facts": self.facts,
-        }
+        result: dict[str, Any] = {"file": str(self.path), "usable": not self.problems}
+        result |= {"problems": self.problems, "facts": self.facts}
         if self.file is not None:
             result |= {
                 "display_window": str(self.file.display_window),
@@ -231,25 +228,23 @@ def _facts(file: ExrFile) -> list[str]:
         window = "" if part.data_window == file.display_window else f", data window {part.data_window}"
         alike.setdefault(f"{types}, {part.compression}, {kind}{window}", []).append(part.name or "unnamed")
     for description, names in alike.items():
-        if len(names) == 1:
-            facts.append(f"part {names[0]}: {description}")
-        else:
-            some = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
-            facts.append(f"{len(names)} parts ({some}): {description}")
+        some = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+        parts = f"part {some}" if len(names) == 1 else f"{len(names)} parts ({some})"
+        facts.append(f"{parts}: {description}")
     return facts
 
 
 def _pixel_facts(render: MappedRender) -> list[str]:
     """Read all features once: count values that are not finite or negative, and name features that are all zero."""
     brightest: dict[str, float] = {}
-    not_finite: dict[str, int] = {}
-    negative: dict[str, int] = {}
+    not_finite: Counter[str] = Counter()
+    negative: Counter[str] = Counter()
     for rows in render.data_window.bands(ROWS_PER_LOAD):
         for name, values in render.read(rows).items():
             finite = np.isfinite(values)
-            not_finite[name] = not_finite.get(name, 0) + int(values.size - np.count_nonzero(finite))
+            not_finite[name] += int(values.size - np.count_nonzero(finite))
             if name not in SIGNED_FEATURES:
-                negative[name] = negative.get(name, 0) + int(np.count_nonzero(finite & (values < 0)))
+                negative[name] += int(np.count_nonzero(finite & (values < 0)))
             brightest[name] = max(brightest.get(name, 0.0), float(np.abs(values[finite]).max(initial=0.0)))
     if brightest[RGB] == 0:
         bright = ", ".join(name for name, value in brightest.items() if value > 0 and name != "alpha")
@@ -257,7 +252,7 @@ def _pixel_facts(render: MappedRender) -> list[str]:
         render.notes.append(f"the beauty is black everywhere{hint}")
     counts = [f"{name}: {n} values are NaN or infinite; fusing repairs them" for name, n in not_finite.items() if n]
     for name, count in negative.items():
-        reason = " (colours out of gamut)" if name in RADIANCE_FEATURES else ""
         if count:
+            reason = " (colours out of gamut)" if name in RADIANCE_FEATURES else ""
             counts.append(f"{name}: {count} values are negative{reason}; fusing sets them to 0")
     return counts + [f"{name}: all zero" for name, value in brightest.items() if value == 0]

@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 
 from oiio_msspl.compare import error_map, open_comparison, upsample_bicubic
-from oiio_msspl.compare_page import from_codes, pack, to_codes, write_page
+from oiio_msspl.compare_page import CODES_PER_STOP, STOPS_BELOW_ONE, pack, to_codes, write_page
 from oiio_msspl.errors import InputError
 from oiio_msspl.image.colour import ACESCG, REC709, conversion, srgb
 from oiio_msspl.image.metrics import psnr, relmse
@@ -22,6 +22,12 @@ from tests.conftest import downsample, noisy, picture, rgb, write_exr
 from tests.exr.sources import behind_a_deep_part
 
 needs_browser = pytest.mark.skipif(not BROWSER, reason="needs Chromium")
+
+
+def from_codes(codes):
+    """The inverse of `to_codes`, after the description in the module."""
+    stops = codes.astype(np.float64) / CODES_PER_STOP - STOPS_BELOW_ONE
+    return (np.exp2(stops) - 2.0**-STOPS_BELOW_ONE).astype(np.float32)
 
 
 def test_codes_are_off_by_half_a_percent_at_most():

@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from oiio_msspl.aovs.formula import FeatureFormula
-from oiio_msspl.aovs.renderers import renderers, view_layer_of
+from oiio_msspl.aovs.renderers import entry_of, renderers, view_layer_of
 from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, matches_layer
@@ -40,11 +40,13 @@ class AdditiveLayer:
     """R, G, B of the layer that it is multiplied by: Cycles' light passes leave the surface colour out."""
 
     @property
-    def words(self) -> frozenset[str]:
-        """What its name says of its light: ``diffuse`` and ``key`` for ``diffuse_key``.
+    def label(self) -> str:
+        """Name for the user."""
+        return f"{self.name} x colour" if self.factor else self.name
 
-        Words for all light are left out.
-        """
+    @property
+    def words(self) -> frozenset[str]:
+        """The kinds of light in its name: ``diffuse`` and ``key`` for ``diffuse_key``."""
         return frozenset(_WORD.findall(self.name.lower())) - _ALL_LIGHT
 
     @property
@@ -68,7 +70,7 @@ class AdditiveSet:
     @property
     def layer_names(self) -> str:
         """Its layers, for the user."""
-        names = ", ".join(f"{layer.name} x colour" if layer.factor else layer.name for layer in self.layers)
+        names = ", ".join(layer.label for layer in self.layers)
         return names + (f"; sums of these: {', '.join(layer.name for layer in self.coarser)}" if self.coarser else "")
 
     def matches(self, pattern: str) -> bool:
@@ -79,101 +81,96 @@ class AdditiveSet:
 def find_additive_sets(
     renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, sums: Sequence[str] = (), path: str = ""
 ) -> list[AdditiveSet]:
-    """The candidates of a file: those of the user, of its renderer, and then of names that any program may use. The
-    first set of a name counts.
+    """Find the candidates of a file: those of the user, of its renderer, and then of names that any program may use.
+
+    The first set of a name counts.
 
     Args:
         renderer: entry of the table.
-        layers: of the file.
+        layers, path: of the file.
         beauty: the one that the sets should sum to; its view and view layer are searched.
         sums: the user's, as ``NAME=a+b+c*d``.
-        path: of the file, for messages.
 
     Raises:
         InputError: a sum of the user can't be read, names a layer that is not there, or has the name of another.
     """
     finder = _Finder(layers, beauty)
     sets = [_user_set(finder, text, path) for text in sums]
-    names = [each.name for each in sets]
+    names = [additive.name for additive in sets]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"--sum: two sets are called {twice[0]!r}; give each a name of its own")
     generic = renderers()[-1]
     for entry in [*renderer.get("sets", ()), *(generic["sets"] if renderer is not generic else ())]:
-        if any(entry["name"] == each.name for each in sets):
+        if any(entry["name"] == additive.name for additive in sets):
             continue
-        found = tuple(dict.fromkeys(layer for candidate in entry["layers"] for layer in finder.find(candidate)))
+        lights = list(dict.fromkeys(light for candidate in entry["layers"] for light in finder.find(candidate)))
         unwanted = entry.get("except", ())
-        found = tuple(each for each in found if not any(fnmatchcase(each.name.lower(), p) for p in unwanted))
-        coarser = tuple(each for each in found if entry.get("finest") and any(each.words < o.words for o in found))
-        finest = tuple(each for each in found if each not in coarser)
+        lights = [light for light in lights if not any(fnmatchcase(light.name.lower(), p) for p in unwanted)]
+        coarser = [a for a in lights if entry.get("finest") and any(a.words < b.words for b in lights)]
+        finest = tuple(light for light in lights if light not in coarser)
         # A part of another set of the table says nothing new, such as raw components of a file without raw layers.
-        same = (set(finest) == set(other.layers) for other in sets)
-        part = (set(finest) <= set(other.layers) for other in sets if not other.by_user)
-        if len(finest) > 1 and not any(same) and not any(part):
-            sets.append(AdditiveSet(entry["name"], finest, coarser))
+        is_known = any(
+            set(finest) == set(additive.layers) or (set(finest) < set(additive.layers) and not additive.by_user)
+            for additive in sets
+        )
+        if len(finest) > 1 and not is_known:
+            sets.append(AdditiveSet(entry["name"], finest, tuple(coarser)))
     return sets
 
 
 class _Finder:
-    """Finds the layers of one view and view layer that hold light."""
+    """Finder of the layers of one view and view layer that hold light."""
 
     def __init__(self, layers: Sequence[Layer], beauty: Beauty) -> None:
-        self._view_layer = beauty.view_layer
-        self._layers = [
-            layer
-            for layer in layers
-            if layer.view in (beauty.view, "") and layer.triple() and layer is not beauty.layer
-        ]
+        self._beauty = beauty
+        named = beauty.layers_of_view(layers)
+        self._layers = [(n, layer) for n, layer in named if layer.triple() and layer is not beauty.layer]
 
     @property
     def known(self) -> str:
         """What :meth:`find` looks for, for messages."""
-        names = ", ".join(layer.name for layer in self._layers[:12] if layer.name)
+        names = ", ".join(layer.name for _, layer in self._layers[:12] if layer.name)
         return f"; it has {names}" if names else ""
 
     def find(self, candidate: str | Mapping[str, str]) -> Iterator[AdditiveLayer]:
-        """The layers that an entry of the table means; none if a factor is missing."""
-        entry = {"layer": candidate} if isinstance(candidate, str) else candidate
-        factor = next(self._named(entry["times"]), None) if "times" in entry else None
+        """Yield the layers that an entry of the table means; none if a factor is missing."""
+        entry = entry_of(candidate)
+        factor = next((layer.triple() for _, layer in self._named(entry["times"])), None) if "times" in entry else None
         if "times" in entry and factor is None:
             return
-        for layer in self._named(entry["layer"]):
+        for name, layer in self._named(entry["layer"]):
             channels = layer.triple()
             assert channels is not None
             if all(channel.type != "uint" for channel in channels):
-                yield AdditiveLayer(self._short(layer.name), channels, factor.triple() if factor else None)
+                yield AdditiveLayer(name, channels, factor)
 
-    def _named(self, alias: str) -> Iterator[Layer]:
-        """The layers of a name, or of a pattern with ``*``, where ``_`` matters: ``C_*`` does not mean ``coat``."""
-        for layer in self._layers:
+    def _named(self, alias: str) -> Iterator[tuple[str, Layer]]:
+        """Yield the layers of a name, or of a pattern with ``*``, where ``_`` matters: ``C_*`` is not ``coat``."""
+        for name, layer in self._layers:
             if "*" in alias:
-                named = fnmatchcase(self._short(layer.name).lower(), alias.lower())
+                is_named = fnmatchcase(name.lower(), alias.lower())
             else:
-                named = view_layer_of(layer.name, alias) in (self._view_layer, "")
-            if named:
-                yield layer
-
-    def _short(self, name: str) -> str:
-        """A layer's name without the view layer."""
-        return name.removeprefix(self._view_layer + ".") if self._view_layer else name
+                is_named = view_layer_of(layer.name, alias) in (self._beauty.view_layer, "")
+            if is_named:
+                yield name, layer
 
 
 def _user_set(finder: _Finder, text: str, path: str) -> AdditiveSet:
-    """The set that ``NAME=a+b+c*d`` describes. A term that ends with ``*`` is a pattern: ``light_*``."""
+    """Return the set that ``NAME=a+b+c*d`` describes. A term that ends with ``*`` is a pattern: ``light_*``."""
     name, _, sum_of = (part.strip() for part in text.partition("="))
     terms = [term.strip() for term in sum_of.split("+")]
     no_sum = InputError(f"--sum {text!r}: write NAME=LAYER+LAYER, LAYER* for several, or LAYER*COLOUR for a product")
     if not name or not all(terms):
         raise no_sum
-    found: dict[AdditiveLayer, None] = {}
+    lights: dict[AdditiveLayer, None] = {}
     for term in terms:
         layer, times, factor = (part.strip() for part in term.partition("*"))
         is_pattern = term.endswith("*")
-        some = list(finder.find({"layer": layer, "times": factor} if times and not is_pattern else term))
-        if not some or (len(some) > 1 and not is_pattern):
-            found_here = f"several layers {term!r}" if some else f"no layer {term!r} of three channels{finder.known}"
-            raise InputError(f"--sum {text!r}: {path} has {found_here}")
-        found |= dict.fromkeys(some)
-    if len(found) < 2:
+        matches = list(finder.find({"layer": layer, "times": factor} if times and not is_pattern else term))
+        if not matches or (len(matches) > 1 and not is_pattern):
+            problem = f"several layers {term!r}" if matches else f"no layer {term!r} of three channels{finder.known}"
+            raise InputError(f"--sum {text!r}: {path} has {problem}")
+        lights |= dict.fromkeys(matches)
+    if len(lights) < 2:
         raise no_sum
-    return AdditiveSet(name, tuple(found), by_user=True)
+    return AdditiveSet(name, tuple(lights), by_user=True)

@@ -41,15 +41,12 @@ class LayerFinder:
         self._view, self._view_layer = view, view_layer
 
     def formula(self, feature: str, candidate: Any, problems: list[str]) -> FeatureFormula | None:
-        """Return the formula that a candidate describes.
+        """Return the formula that a candidate describes; None if a layer is missing or has the wrong channels.
 
         Args:
             feature: the feature that is wanted.
             candidate: checked by :func:`oiio_msspl.aovs.mapping.check_mapping`.
             problems: a sentence is added for a layer that exists but has the wrong channels.
-
-        Returns:
-            None if a layer is missing or has the wrong channels.
 
         Raises:
             InputError: the candidate names another file, which can't be read, shows another frame, or does not have
@@ -161,16 +158,12 @@ class LayerFinder:
         if path not in self._file.siblings:
             self._file.siblings[path] = open_exr(path)
         sibling = self._file.siblings[path]
-        window, frame = sibling.display_window, self._file.display_window
-        if window.size != frame.size:
-            raise InputError(
-                f"{path}: is {window.size}, but {self._file.path} is {frame.size}; give layers of the same frame"
-            )
+        window, frame, render = sibling.display_window, self._file.display_window, self._file.path
         if window != frame:  # pixels are read by their place, so all would be beside the frame
-            raise InputError(
-                f"{path}: its display window is {window}, but that of {self._file.path} is {frame}; "
-                "give layers of the same frame"
-            )
+            sizes = f"is {window.size}, but {render} is {frame.size}"
+            windows = f"its display window is {window}, but that of {render} is {frame}"
+            problem = windows if window.size == frame.size else sizes
+            raise InputError(f"{path}: {problem}; give layers of the same frame")
         return sibling
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a feature is computed from the channels of a file.
+"""Compute a feature from the channels of a file.
 
 Composites follow the paper's equations, variances become the variance of the pixel's mean luminance, and normals become
 signed vectors.
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -50,10 +51,8 @@ class FeatureFormula:
         return len(self.terms) > 1 or self.factor is not None or self.kind != "mean"
 
     def evaluate(self, take: Take) -> Array:
-        """The feature, unless it is a variance: float32 (height, width, 3), in the units of the features."""
-        value = take(self.terms[0])
-        for term in self.terms[1:]:
-            value = value + take(term)
+        """Return the feature, unless it is a variance: float32 (height, width, 3), in the units of the features."""
+        value = reduce(np.add, map(take, self.terms))
         if self.factor is not None:
             value = value * take(self.factor)
         if self.encoding != "unsigned":
@@ -63,15 +62,12 @@ class FeatureFormula:
         return normal
 
     def evaluate_variance(self, take: Take, mean: Array, spp: float | None) -> Array:
-        """Variance of the pixel's mean luminance, (height, width, 1).
+        """Return the variance of the pixel's mean luminance, (height, width, 1).
 
         A variance of colours is turned into one of luminance as if the noise of R, G and B were fully correlated:
         sigma_Y = sum of w_c sigma_c. Monte Carlo noise nearly is, because one path carries all three.
 
-        Args:
-            take: gives the pixels of channels.
-            mean: the pixel's colour, (height, width, 3).
-            spp: samples per pixel; needed for the kinds in ``NEEDS_SPP``.
+        ``mean`` is the pixel's colour, (height, width, 3). The kinds in ``NEEDS_SPP`` need the samples per pixel.
         """
         if self.kind == "halves":
             # The mean of two independent halves a and b of the samples has the variance (a - b)^2 / 4.

@@ -15,7 +15,7 @@ from oiio_msspl.aovs.features import ALBEDO, FEATURES, PAPER_FEATURES, RGB, VARI
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.motion import MotionLayers
 from oiio_msspl.exr.layers import layers_of
-from oiio_msspl.exr.reader import Channel, ExrFile
+from oiio_msspl.exr.reader import Channel, ExrFile, adjacent
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.image.arrays import Array, blank, unload
 from oiio_msspl.image.colour import REC709, ColourSpace
@@ -54,17 +54,14 @@ class MappedRender:
 
     @property
     def name(self) -> str:
-        """Path of the file."""
         return str(self.file.path)
 
     @property
     def display_window(self) -> Window:
-        """The frame that the camera shows."""
         return self.file.display_window
 
     @property
     def pixel_aspect(self) -> float:
-        """Width of a pixel divided by its height."""
         return self.file.pixel_aspect
 
     @property
@@ -110,13 +107,9 @@ class MappedRender:
     def unused_layers(self, views: Sequence[MappedRender], fused: Iterable[AdditiveSet]) -> list[str]:
         """Name the flat layers that are neither read as features nor fused.
 
-        Args:
-            views: the file, mapped for the other views.
-            fused: the additive sets that are fused.
-
-        Returns:
-            Names of layers; those of single channels if the layer is read in part or has no name. The view follows in
-            brackets if it is not the chosen one.
+        ``views`` are the file, mapped for the other views, and ``fused`` the additive sets that are fused. Of a layer
+        that is read in part or has no name, the channels are named. The view follows in brackets if it is not the
+        chosen one.
         """
         used = {c for view in (self, *views) for formula in view._formulas.values() for c in formula.channels}
         used |= {channel for additive in fused for layer in additive.layers for channel in layer.channels}
@@ -134,14 +127,9 @@ class MappedRender:
         return self.features | ({"alpha": FeatureFormula(((self.alpha,),))} if self.alpha else {})
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """Return features over a rectangle, float32 (height, width, channels), in the units of the features.
+        """Return features and ``alpha`` over a rectangle, as :meth:`oiio_msspl.exr.render.ReadableRender.read` does.
 
-        Channels are contiguous in memory; features of one file may be views of one array. Values are as the renderer
-        wrote them: NaN and infinities may be among them.
-
-        Args:
-            window: a rectangle inside the data window.
-            features: names of features, and ``alpha``; all if None. Those that the render lacks are left out.
+        Channels are contiguous in memory; features of one file may be views of one array.
 
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
@@ -152,32 +140,27 @@ class MappedRender:
         self, window: Window, features: Iterable[str] | None, more: Sequence[Channel]
     ) -> tuple[dict[str, Array], Array]:
         """Read features and, as they are stored, more channels, (height, width, channels)."""
-        available = self._formulas
+        available, beauty = self._formulas, self.features[RGB].terms[0]
         names = (*FEATURES, "alpha") if features is None else features
         formulas = {name: available[name] for name in names if name in available}
-        channels = [c for formula in formulas.values() for c in formula.channels]
-        if VARIANCE in formulas:
-            channels += self.features[RGB].channels
-        channels = list(dict.fromkeys([*channels, *more]))
+        needed = [c for formula in formulas.values() for c in formula.channels]
+        channels = list(dict.fromkeys([*needed, *(beauty if VARIANCE in formulas else ()), *more]))
         pixels = self.file.read(channels, window)
         place = {channel: i for i, channel in enumerate(channels)}
 
         def take(group: Sequence[Channel]) -> Array:
-            places = [place[c] for c in group]
-            adjacent = places == list(range(places[0], places[-1] + 1))
-            return pixels[..., places[0] : places[-1] + 1] if adjacent else pixels[..., places]
+            return pixels[..., adjacent([place[c] for c in group])]
 
         result: dict[str, Array] = {}
         with np.errstate(all="ignore"):  # the caller repairs and counts NaN and infinities
             for name, formula in formulas.items():
                 if name == VARIANCE:
-                    result[name] = formula.evaluate_variance(take, take(self.features[RGB].terms[0]), self.spp)
+                    result[name] = formula.evaluate_variance(take, take(beauty), self.spp)
                 else:
                     result[name] = formula.evaluate(take)
         return result, take(more) if more else pixels[..., :0]
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
-        """Keep decoded rows between reads, see :meth:`oiio_msspl.exr.reader.ExrFile.cache_strips`."""
         return self.file.cache_strips(max_bytes)
 
     def unload(self) -> None:
@@ -192,12 +175,8 @@ class MappedRender:
     ) -> tuple[Render, Array]:
         """Read the whole render into memory, and some channels as they are stored, float32 (height, width, channels).
 
-        Layers of one part are decoded together, so this is faster than reading the channels later.
-
-        Args:
-            channels: of the file or its siblings.
-            features: as for :meth:`read`.
-            on_disk: keep the features in temporary files instead.
+        Layers of one part are decoded together, so this is faster than reading the channels later. With ``on_disk``,
+        the features lie in temporary files.
 
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
@@ -215,11 +194,7 @@ class MappedRender:
         return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name), stored
 
     def check_pixels(self, channels: Sequence[Channel], features: Iterable[str]) -> None:
-        """Decode the pixels that :meth:`load_with` would read, and keep nothing.
-
-        Raises:
-            InputError: pixels can't be decoded, because a file is truncated or corrupt.
-        """
+        """Raise InputError if pixels that :meth:`load_with` would read can't be decoded."""
         for window in self.data_window.bands(ROWS_PER_LOAD):
             self._read_with(window, features, channels)
 

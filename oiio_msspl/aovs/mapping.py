@@ -29,12 +29,9 @@ _EXTRAS = {"times", "kind", "encoding", "note"}
 
 
 def read_map_file(path: str | Path) -> dict[str, Any]:
-    """Read a user's mapping: a TOML file with lines ``feature = candidate``.
+    """Read a user's mapping, candidates by feature: a TOML file with lines ``feature = candidate``.
 
-    Its EXR files (``file:masks/albedo.exr``) are relative to the folder of the TOML file.
-
-    Returns:
-        Candidates by feature, with full paths.
+    Its EXR files (``file:masks/albedo.exr``) are relative to the folder of the TOML file; the result has full paths.
 
     Raises:
         InputError: the file can't be read, or an entry is not a candidate.
@@ -54,13 +51,10 @@ def read_map_file(path: str | Path) -> dict[str, Any]:
 
 
 def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
-    """Parse ``--map feature=layer`` options.
+    """Parse ``--map feature=layer`` options into candidates by feature.
 
-    Args:
-        options: ``layer`` may be a sum (``lighting+GI``), an EXR (``a.exr``) or a layer of it (``a.exr:albedo``).
-
-    Returns:
-        Candidates by feature, with full paths: a farm's worker reads them in another folder.
+    ``layer`` may be a sum (``lighting+GI``), an EXR (``a.exr``) or a layer of it (``a.exr:albedo``). Paths become full
+    paths, because a farm's worker reads them in another folder.
 
     Raises:
         InputError: ``=`` is missing, the feature is unknown, or it can't be read in this form.
@@ -91,17 +85,9 @@ def is_exr(text: str) -> bool:
 
 
 def check_mapping(mapping: dict[str, Any], where: str) -> dict[str, Any]:
-    """Check that features can be read from the candidates of a mapping.
+    """Return a mapping, or raise InputError if a feature is unknown or can't be read from its candidate.
 
-    Args:
-        mapping: candidates by feature.
-        where: beginning of the message, such as the path of the file.
-
-    Returns:
-        ``mapping``.
-
-    Raises:
-        InputError: a feature is unknown, or can't be read from its candidate.
+    ``where`` is the beginning of the message, such as the path of the file.
     """
     for feature, candidate in mapping.items():
         if feature not in FEATURES:

@@ -104,7 +104,6 @@ def map_render(
 
 
 def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:
-    """Refuse a file that by its name holds a single AOV."""
     if "not_beauty" in renderer and re.search(renderer["not_beauty"], file.path.stem):
         raise InputError(
             f"{file.path}: holds {renderer['name']}'s {file.path.stem} alone, no beauty; give the RGB file beside it "
@@ -171,20 +170,15 @@ def _decide_normal_encoding(render: MappedRender) -> None:
     formula = render.features.get(NORMAL)
     if formula is None or formula.encoding != "auto":
         return
-    bands = [render.file.read(formula.terms[0], rows) for rows in _bands(render.data_window)]
-    normal = np.concatenate([band.reshape(-1, 3) for band in bands])
+    window, bands = render.data_window, [render.data_window]
+    last = window.height - _ROWS_PER_BAND
+    if window.height > _BANDS_OF_NORMALS * _ROWS_PER_BAND:
+        tops = (window.y0 + last * i // (_BANDS_OF_NORMALS - 1) for i in range(_BANDS_OF_NORMALS))
+        bands = [Window(window.x0, top, window.x1, top + _ROWS_PER_BAND) for top in tops]
+    normal = np.concatenate([render.file.read(formula.terms[0], band).reshape(-1, 3) for band in bands])
     normal = normal[np.isfinite(normal).all(axis=1) & (np.abs(normal).max(axis=1) > 0)]
     unsigned = len(normal) > 0 and normal.min() >= 0 and _unit_fraction(normal * 2 - 1) > _unit_fraction(normal)
     render.features[NORMAL] = replace(formula, encoding="unsigned" if unsigned else "signed")
-
-
-def _bands(window: Window) -> list[Window]:
-    """Return bands of rows, evenly spread over a window; the whole window if it is small."""
-    if window.height <= _BANDS_OF_NORMALS * _ROWS_PER_BAND:
-        return [window]
-    last = window.y1 - _ROWS_PER_BAND
-    tops = [window.y0 + (last - window.y0) * i // (_BANDS_OF_NORMALS - 1) for i in range(_BANDS_OF_NORMALS)]
-    return [Window(window.x0, top, window.x1, top + _ROWS_PER_BAND) for top in tops]
 
 
 def _unit_fraction(vectors: Array) -> float:

@@ -127,7 +127,7 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
         layers: of the file.
         beauty: the one that was chosen; its view and view layer are searched.
     """
-    named = dict(_layers_of_view(layers, beauty))
+    named = {name: layer for name, layer in beauty.layers_of_view(layers) if name}
     common = renderers()[-1]
     vectors: dict[tuple[Channel, Channel], MotionField] = {}
     for entry in [*renderer.get("motion", ()), *common["motion"]]:
@@ -216,13 +216,6 @@ def _problem_of_word(key: str, equals: str, value: str) -> str:
     if key == "premultiplied":
         return "premultiplied stands alone; leave it out if they are not" if equals else ""
     return "" if equals and value else f"write {key}=..."
-
-
-def _layers_of_view(layers: Sequence[Layer], beauty: Beauty) -> Iterator[tuple[str, Layer]]:
-    """Yield the layers of the beauty's view and view layer, and those of none, with their short names."""
-    for layer in layers:
-        if layer.view in (beauty.view, "") and layer.name:
-            yield layer.name.removeprefix(beauty.view_layer + ".") if beauty.view_layer else layer.name, layer
 
 
 def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:

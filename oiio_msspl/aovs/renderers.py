@@ -37,10 +37,7 @@ def entry_of(candidate: str | Mapping[str, Any]) -> Mapping[str, Any]:
 def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) -> float | None:
     """Read the samples per pixel from the header; None if it does not say, or says no number above 0.
 
-    Args:
-        renderer: entry of the table.
-        file: the render.
-        view_layer: the chosen one, because Blender writes an attribute for each view layer.
+    Blender writes an attribute for each view layer.
     """
     for rule in renderer.get("spp", ()):
         matches = [match for key in file.metadata if (match := re.search(rule["attribute"], key))]
@@ -67,13 +64,10 @@ def layer_of_source(renderer: dict[str, Any], file: ExrFile, aov: str) -> str | 
 
 
 def view_layer_of(layer: str, alias: str) -> str | None:
-    """Return the view layer in front of ``alias`` in the name of an EXR layer.
+    """Return the view layer in front of ``alias`` in the name of an EXR layer; None if it means another layer.
 
-    Names are compared without case, spaces, ``_`` and ``-``; ``*`` in the alias matches any text.
-
-    Returns:
-        ``ViewLayer`` for the layer ``ViewLayer.Combined`` and the alias ``combined``; empty if the alias is the whole
-        name; None if the alias means another layer.
+    It is ``ViewLayer`` for the layer ``ViewLayer.Combined`` and the alias ``combined``, and empty if the alias is the
+    whole name. Names are compared without case, spaces, ``_`` and ``-``; ``*`` in the alias matches any text.
     """
     name, wanted = same_spelling(layer), same_spelling(alias)
     if name == wanted or ("*" in wanted and fnmatchcase(name, wanted)):

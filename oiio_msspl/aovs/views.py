@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from oiio_msspl.aovs.renderers import entry_of, view_layer_of
@@ -25,6 +25,11 @@ class Beauty(NamedTuple):
     def label(self) -> str:
         """Name for the user: ``left``, ``ViewLayer`` or ``left/ViewLayer``."""
         return "/".join(name for name in (self.view, self.view_layer) if name)
+
+    def layers_of_view(self, layers: Iterable[Layer]) -> Iterator[tuple[str, Layer]]:
+        """Yield the layers of the beauty's view, and those of none, with their names behind its view layer."""
+        prefix = f"{self.view_layer}." if self.view_layer else ""
+        return ((layer.name.removeprefix(prefix), layer) for layer in layers if layer.view in (self.view, ""))
 
 
 def name_of(view: str) -> str:

@@ -32,10 +32,7 @@ _ABANDONED = 24 * 3600
 
 
 def check_target(path: str | Path, *, overwrite: bool) -> Path:
-    """Check that a file can be written at ``path``, before any work is done.
-
-    Returns:
-        ``path`` as a ``Path``.
+    """Check that a file can be written at ``path``, before any work is done, and return it as a ``Path``.
 
     Raises:
         InputError: the file exists and may not be overwritten, is write-protected or a folder, or its folder is
@@ -93,11 +90,7 @@ def check_encodable(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Check the folder of ``path``; if ``path`` is a link, the folder of the file that it points to.
-
-    Raises:
-        InputError: it is missing or read-only.
-    """
+    """Raise InputError if the folder of ``path``, or of the file that a link points to, is missing or read-only."""
     folder = Path(os.path.realpath(path)).parent if path.is_symlink() else path.parent
     if not folder.is_dir():
         raise InputError(f"{path}: the folder {folder} does not exist; create it first")
@@ -106,11 +99,7 @@ def check_folder(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder if it does not exist.
-
-    Raises:
-        InputError: it can't be made.
-    """
+    """Make a folder if it does not exist, or raise InputError."""
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -186,11 +175,7 @@ def remove_leftovers(targets: Iterable[Path]) -> None:
 
 
 def temporary_folder(folder: Path) -> tempfile.TemporaryDirectory[str]:
-    """Make a hidden folder ``.msspl-MACHINE-PROCESS-RANDOM``, which is deleted when its ``with`` block ends.
-
-    Raises:
-        OSError: it can't be made.
-    """
+    """Make a hidden folder ``.msspl-MACHINE-PROCESS-RANDOM``, deleted when its ``with`` block ends (or OSError)."""
     return tempfile.TemporaryDirectory(prefix=f".msspl-{_machine()}-{os.getpid()}-", dir=folder.absolute())
 
 
@@ -225,17 +210,14 @@ def _hash(text: str) -> str:
 
 def _is_abandoned(temporary: Path, machine: str, process: int) -> bool:
     # On Windows, os.kill would end the process.
-    if machine == _machine() and sys.platform != "win32":
-        try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            return True
-        except (OSError, OverflowError):
-            return False
-        return False
-    # The clocks of two machines may differ, but not by a day.
-    with suppress(OSError):
-        return time.time() - temporary.stat().st_mtime > _ABANDONED
+    with suppress(OSError, OverflowError):
+        if machine == _machine() and sys.platform != "win32":
+            try:
+                os.kill(process, 0)
+            except ProcessLookupError:
+                return True
+        else:  # the clocks of two machines may differ, but not by a day
+            return time.time() - temporary.stat().st_mtime > _ABANDONED
     return False
 
 

@@ -102,13 +102,7 @@ def stored_type(beauty: Sequence[Channel], options: WriteOptions) -> str:
 
 
 def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequence[str]) -> frozenset[Channel]:
-    """Return the channels of the HRLS that are neither replaced nor passed on.
-
-    Args:
-        file: the HRLS.
-        beauty: channels of the HRLS that the fused beauty replaces.
-        patterns: ``WriteOptions.layers``. A pattern matches the name of a layer or of a channel, see
-            :func:`oiio_msspl.exr.layers.matches_layer`.
+    """Return the channels of the HRLS that are not the beauty, and that no pattern of ``WriteOptions.layers`` matches.
 
     Raises:
         InputError: a pattern matches nothing.

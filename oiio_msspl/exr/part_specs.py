@@ -18,17 +18,19 @@ from oiio_msspl.exr.reader import Channel, ExrFile, Part
 from oiio_msspl.exr.write_options import COMPONENTS
 
 #: Attributes that say how the source was stored. The writer sets them again, or they have no meaning in the copy.
-_STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
-#: ST 2065-4 forbids compression and AOVs in a file that carries this flag.
-_ACES_FLAG = "acesImageContainerFlag"
+_STRUCTURE = (
+    *("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type"),
+    "acesImageContainerFlag",  # ST 2065-4 forbids compression and AOVs in a file that carries it
+)
 #: Effort of ZIP, 1 to 9. OpenEXR's default is 4, which takes a third longer and makes renders 1 to 2 % smaller.
 ZIP_LEVEL = 1
 #: Attributes that OpenEXR requires to be equal in all parts of a file. Only the first part may have one alone.
 _SHARED = ("PixelAspectRatio", "chromaticities", "smpte:TimeCode")
-#: Attributes that OpenImageIO would fill in with defaults in every part that lacks them.
-_FILLED_IN = ("screenWindowWidth", "screenWindowCenter", "DateTime")
-#: Attributes that every part keeps.
-_KEPT_IN_EVERY_PART = (*_FILLED_IN, *_SHARED, "view", "name", "oiio:subimagename", "compression")
+#: Attributes that every part keeps. OpenImageIO would fill in defaults for the first three.
+_KEPT_IN_EVERY_PART = (
+    *("screenWindowWidth", "screenWindowCenter", "DateTime"),
+    *(*_SHARED, "view", "name", "oiio:subimagename", "compression"),
+)
 
 #: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.
 LARGEST_MIXED_PART = 256 << 20
@@ -40,20 +42,6 @@ class _NameOrigin(IntEnum):
     PART = 0
     LAYER = 1
     MADE_UP = 2
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """A future part: a whole part of the HRLS, or its channels of one layer and pixel type."""
-
-    source: Part
-    view: str
-    channels: tuple[Channel, ...]
-    whole: bool
-    name: str
-    origin: _NameOrigin
-    repeats_metadata: bool
-    """Another part that is written holds the metadata of ``source``."""
 
 
 @dataclass(frozen=True)
@@ -94,29 +82,26 @@ def extra_spec(contents: FileContents, name: str, taken: set[str]) -> Any:
 
 
 def passed_on_parts(contents: FileContents, taken: set[str]) -> Iterator[PassedOnPart]:
-    """Yield parts with all channels of the HRLS that are neither fused nor dropped.
+    """Yield parts with all channels of the HRLS that are neither fused nor dropped, and add their names to ``taken``.
 
     A part stays whole if it can. Others are split into one part for each layer and pixel type.
-
-    Args:
-        contents: the file to write.
-        taken: names of the parts so far; those of the new parts are added.
     """
-    pieces = list(_pieces(contents))
-    for piece in pieces:
-        stronger = (p for p in pieces if p.origin < piece.origin or p.name != piece.name)
-        name = _unique(piece.name, taken, {p.name for p in stronger if p.origin <= piece.origin})
-        yield _whole_part(piece.source, name) if piece.whole else _layer_part(contents, piece, name)
+    named = list(_named_parts(contents))
+    for name, origin, part in named:
+        reserved = {n for n, o, _ in named if o < origin or (o == origin and n != name)}
+        _set_name(part.spec, _unique(name, taken, reserved))
+        yield part
 
 
-def _pieces(contents: FileContents) -> Iterator[_Piece]:
+def _named_parts(contents: FileContents) -> Iterator[tuple[str, _NameOrigin, PassedOnPart]]:
+    """Yield the parts that are passed on, with the names that they should have."""
     layer_of = contents.layers
     for part in contents.source.parts:
         if part.deep:
             continue
         if _stays_whole(part, contents):
-            name, origin = part.name or f"part{part.index}", _NameOrigin.PART if part.name else _NameOrigin.MADE_UP
-            yield _Piece(part, part.view, part.channels, True, name, origin, repeats_metadata=False)
+            origin = _NameOrigin.PART if part.name else _NameOrigin.MADE_UP
+            yield part.name or f"part{part.index}", origin, _whole_part(part)
             continue
         groups: dict[tuple[str, str, str], list[Channel]] = {}
         for channel in part.channels:
@@ -127,9 +112,13 @@ def _pieces(contents: FileContents) -> Iterator[_Piece]:
                 groups.setdefault(key, []).append(channel)
         # Metadata is written once: in the beauty's part, or in the first part that this one is split into.
         repeats_metadata = not set(contents.beauty).isdisjoint(part.channels)
-        for (view, layer_name, _), channels in groups.items():
+        for (view, layer_name, kind), channels in groups.items():
             name, origin = _layer_name(contents, part, view, layer_name, channels)
-            yield _Piece(part, view, tuple(channels), False, name, origin, repeats_metadata)
+            names = _components(channels) if contents.options.layout == "nuke" else [c.name for c in channels]
+            spec = _spec(part, name, names, kind, view)
+            if repeats_metadata:
+                _drop_repeated_attributes(spec)
+            yield name, origin, PassedOnPart(spec, part, tuple(runs(channels)))
             repeats_metadata = True
 
 
@@ -154,14 +143,12 @@ def _has_one_type(part: Part) -> bool:
     return len({channel.type for channel in part.channels}) == 1
 
 
-def _whole_part(part: Part, name: str) -> PassedOnPart:
+def _whole_part(part: Part) -> PassedOnPart:
     spec = oiio.ImageSpec(part.spec)
     spec.channelnames = tuple(channel.name for channel in part.channels)
-    _name_and_compress(spec, name, lossless(part))
-    if not _has_one_type(part):
-        return PassedOnPart(spec, part, None)
     spec.tile_width = spec.tile_height = spec.tile_depth = 0
-    return PassedOnPart(spec, part, (part.channels,))
+    _drop_structure(spec, lossless(part))
+    return PassedOnPart(spec, part, (part.channels,) if _has_one_type(part) else None)
 
 
 def _layer_name(
@@ -180,16 +167,6 @@ def _layer_name(
         name = f"{plain}.{view}" if view and view != contents.view else plain
         is_parts = name == part.name
     return name, _NameOrigin.PART if is_parts else _NameOrigin.LAYER if layer else _NameOrigin.MADE_UP
-
-
-def _layer_part(contents: FileContents, piece: _Piece, name: str) -> PassedOnPart:
-    channels = piece.channels
-    nuke = contents.options.layout == "nuke"
-    names = _components(channels) if nuke else [c.name for c in channels]
-    spec = _spec(piece.source, name, names, channels[0].type, piece.view)
-    if piece.repeats_metadata:
-        _drop_repeated_attributes(spec)
-    return PassedOnPart(spec, piece.source, tuple(runs(channels)))
 
 
 def _components(channels: Sequence[Channel]) -> list[str]:
@@ -242,7 +219,8 @@ def _spec(part: Part, name: str, channels: list[str], kind: str, view: str) -> A
     spec.channelnames = tuple(channels)
     spec.channelformats = ()
     spec.format = oiio.TypeDesc(kind)
-    _name_and_compress(spec, name, lossless(part))
+    _drop_structure(spec, lossless(part))
+    _set_name(spec, name)
     spec.erase_attribute("multiView")  # it names the views of a part that has several
     if view:
         spec.attribute("view", view)
@@ -257,12 +235,15 @@ def _drop_repeated_attributes(spec: Any) -> None:
             spec.erase_attribute(name)
 
 
-def _name_and_compress(spec: Any, name: str, compression: str) -> None:
-    for attribute in (*_STRUCTURE, _ACES_FLAG):
+def _drop_structure(spec: Any, compression: str) -> None:
+    for attribute in _STRUCTURE:
         spec.erase_attribute(attribute)
+    _compress(spec, compression)
+
+
+def _set_name(spec: Any, name: str) -> None:
     spec.attribute("oiio:subimagename", name)
     spec.attribute("name", name)
-    _compress(spec, compression)
 
 
 def _compress(spec: Any, compression: str) -> None:

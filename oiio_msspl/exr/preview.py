@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.render import Window
-from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
+from oiio_msspl.exr.strips import ROWS_PER_STRIP
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import REC709, ColourSpace, conversion, srgb
 from oiio_msspl.image.parallel import one_ahead
@@ -49,11 +49,7 @@ def old_preview(exr: Path) -> Path | None:
 
 
 def check_view(view: str) -> None:
-    """Check the name of an OpenColorIO view.
-
-    Raises:
-        InputError: the configuration has no such view.
-    """
+    """Raise InputError if the OpenColorIO configuration has no such view."""
     views = oiio.ColorConfig(OCIO_CONFIG).getViewNames(OCIO_DISPLAY)
     if view not in views:
         raise InputError(f"--view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")
@@ -74,8 +70,7 @@ def write_preview(
     Args:
         path: the PNG to write.
         rgb: scene linear, (height, width, 3), over ``data_window``.
-        data_window: the pixels that ``rgb`` covers.
-        display_window: the frame, which the PNG shows.
+        data_window, display_window: the pixels that ``rgb`` covers, and the frame, which the PNG shows.
         view: None for the paper's sRGB curve; otherwise a view of OpenColorIO's built-in CG configuration, e.g.
             ``Un-tone-mapped`` or ``ACES 1.0 - SDR Video``.
         space: linear RGB space of ``rgb``; converted to Rec. 709 for the picture.
@@ -89,9 +84,7 @@ def write_preview(
         check_view(view)
     to_rec709 = None if space == REC709 else conversion(space, REC709).T.astype(np.float32)
 
-    def rows(start: int, stop: int) -> Pixels:
-        y0 = display_window.y0
-        strip = Window(display_window.x0, y0 + start, display_window.x1, y0 + stop)
+    def rows(strip: Window) -> Pixels:
         linear = np.zeros((strip.height, strip.width, 3), dtype=rgb.dtype)
         rendered = data_window.intersect(strip)
         if rendered.width and rendered.height:
@@ -100,24 +93,20 @@ def write_preview(
             linear = linear @ to_rec709
         return _srgb_pixels(linear) if view is None else _to_8_bits(_through_ocio(linear, view))
 
-    _write_png(path, display_window.width, display_window.height, rows, SOFTWARE, overwrite)
+    _write_png(path, display_window, rows, SOFTWARE, overwrite)
 
 
 def write_png(path: Path, display: Array, *, software: str = SOFTWARE, overwrite: bool = False) -> None:
-    """Write a PNG of display values, atomically.
+    """Write a PNG of display values (height, width, 3), clipped to [0, 1], atomically.
 
-    Args:
-        path: the PNG to write.
-        display: (height, width, 3), clipped to [0, 1].
-        software: the PNG's "Software" entry. :func:`is_our_preview` takes a picture for a preview by it.
-        overwrite: replace an existing file.
+    ``software`` is the PNG's "Software" entry. :func:`is_our_preview` takes a picture for a preview by it.
 
     Raises:
         InputError: ``path`` exists.
         MssplError: the file can't be written.
     """
-    height, width = display.shape[:2]
-    _write_png(path, width, height, lambda start, stop: _to_8_bits(display[start:stop]), software, overwrite)
+    whole = Window(0, 0, display.shape[1], display.shape[0])
+    _write_png(path, whole, lambda strip: _to_8_bits(display[strip.y0 : strip.y1]), software, overwrite)
 
 
 def _to_8_bits(display: Array) -> Pixels:
@@ -137,15 +126,13 @@ def _srgb_table() -> Pixels:
     return _to_8_bits(srgb(np.nan_to_num(halves, posinf=1, neginf=0)))
 
 
-def _write_png(
-    path: Path, width: int, height: int, rows: Callable[[int, int], Pixels], software: str, overwrite: bool
-) -> None:
-    """Write the rows that ``rows(start, stop)`` gives, a strip at a time: a large frame needs no second copy."""
+def _write_png(path: Path, window: Window, rows: Callable[[Window], Pixels], software: str, overwrite: bool) -> None:
+    """Write the pixels that ``rows`` gives for each strip of a window: a large frame needs no second copy."""
     with replacing(path, overwrite=overwrite) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
         if writer is None:
             raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
-        spec = oiio.ImageSpec(width, height, 3, "uint8")
+        spec = oiio.ImageSpec(window.width, window.height, 3, "uint8")
         spec.attribute("oiio:ColorSpace", "sRGB")
         spec.attribute("Software", software)
         spec.attribute("png:compressionLevel", 1)
@@ -154,10 +141,10 @@ def _write_png(
         # Search for runs of equal bytes only: filtered rows of a render repeat little else.
         spec.attribute("compression", "rle")
         ok = writer.open(str(temporary), spec)
-        ranges = strip_rows(0, height, 0, ROWS_PER_STRIP, height)
+        strips = window.bands(ROWS_PER_STRIP)
         # The next rows are converted while OpenImageIO compresses these.
-        for start, stop, pixels in one_ahead((a, b, np.ascontiguousarray(rows(a, b))) for a, b in ranges):
-            ok = ok and writer.write_scanlines(start, stop, 0, pixels)
+        for strip, pixels in one_ahead((strip, np.ascontiguousarray(rows(strip))) for strip in strips):
+            ok = ok and writer.write_scanlines(strip.y0 - window.y0, strip.y1 - window.y0, 0, pixels)
         ok = writer.close() and ok
         if not ok:
             raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")

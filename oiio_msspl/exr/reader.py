@@ -151,11 +151,8 @@ class ExrFile:
 
         Read windows from left to right and from top to bottom: every row is then decoded once for each row of windows.
         The cache holds the rows of the last window over the full width: 2 bytes for each pixel of a channel if all
-        channels that are read from the part are half, otherwise 4.
-
-        Args:
-            max_bytes: size of the cache; small parts of strips are kept beyond it. Rows that do not fit are decoded
-                again for each window.
+        channels that are read from the part are half, otherwise 4. Rows beyond ``max_bytes`` are decoded again for each
+        window; only small parts of strips are kept beyond it.
         """
         self._cache.max_bytes = max_bytes
         try:
@@ -204,10 +201,8 @@ class ExrFile:
         area = window.intersect(whole)
         if area.width == 0 or area.height == 0:
             return
-        positions, indices = list(columns), tuple(columns.values())
-        adjacent = positions == list(range(positions[0], positions[-1] + 1))
-        # A slice is copied several times as fast as a list of indices.
-        planes = slice(positions[0], positions[-1] + 1) if adjacent else positions
+        indices = tuple(columns.values())
+        planes = adjacent(list(columns))
         for y0, y1 in strip_rows(area.y0, area.y1, whole.y0, part.strip_height, whole.y1):
             if not (cache.max_bytes or part.tile[1]):  # only this read needs these rows
                 y0, y1 = max(y0, area.y0), min(y1, area.y1)
@@ -226,8 +221,7 @@ class ExrFile:
         strip = self._decode(part, y0, y1, first, last, "half" if all(c.type == "half" for c in decoded) else "float")
         dtype = np.float16 if all(part.channels[i].type == "half" for i in indices) else np.float32
         planes = np.empty((len(indices), *strip.shape[:2]), dtype)
-        columns = [i - first for i in indices]
-        wanted = slice(None) if columns == list(range(last - first)) else columns
+        wanted = adjacent([i - first for i in indices])
         for row, pixels in enumerate(strip):  # a row fits into the processor's cache, which makes this twice as fast
             planes[:, row] = pixels.T[wanted]
         return planes.transpose(1, 2, 0)
@@ -242,6 +236,12 @@ class ExrFile:
         if strip is None:
             raise unreadable(self.path, part, reason_of(self._input), f", rows {y0} to {y1 - 1}")
         return np.asarray(strip)
+
+
+def adjacent(indices: list[int]) -> slice | list[int]:
+    """Return indices as a slice if each follows the one before: it is copied several times as fast as a list."""
+    run = slice(indices[0], indices[-1] + 1)
+    return run if indices == list(range(run.start, run.stop)) else indices
 
 
 def use_threads(count: int) -> None:
@@ -279,13 +279,8 @@ def open_exr(path: str | Path) -> ExrFile:
         raise InputError(f"{path}: holds no image")
     first = parts[0].spec
     x, y = first.full_x, first.full_y
-    return ExrFile(
-        path=path,
-        parts=tuple(parts),
-        display_window=Window(x, y, x + first.full_width, y + first.full_height),
-        pixel_aspect=float(metadata.get("PixelAspectRatio", 1.0)),
-        metadata=metadata,
-    )
+    frame = Window(x, y, x + first.full_width, y + first.full_height)
+    return ExrFile(path, tuple(parts), frame, float(metadata.get("PixelAspectRatio", 1.0)), metadata)
 
 
 def _open(path: Path) -> Any:
@@ -310,14 +305,12 @@ def _refused(path: Path, reason: str) -> InputError:
 
 def _part(path: Path, index: int, spec: Any) -> Part:
     types = [str(t) for t in spec.channelformats] or [str(spec.format)] * spec.nchannels
+    named = enumerate(zip(map(_text, spec.channelnames), types, strict=True))
     return Part(
         index=index,
         name=_text(str(spec.getattribute("oiio:subimagename") or "")),
         view=_text(str(spec.getattribute("view") or "")),
-        channels=tuple(
-            Channel(path, index, i, _text(name), kind)
-            for i, (name, kind) in enumerate(zip(spec.channelnames, types, strict=True))
-        ),
+        channels=tuple(Channel(path, index, i, name, kind) for i, (name, kind) in named),
         data_window=Window(spec.x, spec.y, spec.x + spec.width, spec.y + spec.height),
         compression=str(spec.getattribute("compression") or "none").split(":")[0],
         tile=(spec.tile_width, spec.tile_height),

@@ -83,7 +83,7 @@ class Render:
 
         Args:
             name: for messages.
-            layers: float (height, width, channels), of those in ``CHANNELS``; ``rgb`` is required.
+            layers: float (height, width, channels), of those in ``CHANNELS``.
 
         Raises:
             ValueError: ``rgb`` is missing, a name is unknown, sizes differ or are 0, a layer has the wrong number of

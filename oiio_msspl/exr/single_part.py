@@ -21,6 +21,7 @@ from oiio_msspl.exr.part_specs import runs
 from oiio_msspl.exr.reader import Channel, Part
 from oiio_msspl.exr.replaced import DTYPES
 from oiio_msspl.exr.write_options import COMPONENTS
+from oiio_msspl.image.arrays import planes_of
 
 #: Header entries that describe how the source was stored. ST 2065-4 forbids the ACES flag in a file with AOVs.
 _STRUCTURE = ("channels", "chunkCount", "lineOrder", "acesImageContainerFlag", "tiles", "name")
@@ -37,8 +38,7 @@ def write_single_part(path: Path, contents: FileContents) -> None:
     """
     import OpenEXR
 
-    channels = _fused_channels(contents)
-    _add_passed_on_channels(contents, channels)
+    channels = _fused_channels(contents) | _passed_on_channels(contents)
     header = _header(contents)
     try:
         with OpenEXR.File(header, channels) as file:
@@ -50,29 +50,28 @@ def write_single_part(path: Path, contents: FileContents) -> None:
 def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
     """Return the fused beauty and the further layers, (height, width) by channel name."""
     height = contents.pixels.rgb.shape[0]
-    beauty = contents.pixels.rows(0, height)
-    channels = {c.name: np.ascontiguousarray(beauty[..., i]) for i, c in enumerate(contents.beauty)}
+    channels = dict(zip([c.name for c in contents.beauty], planes_of(contents.pixels.rows(0, height)), strict=True))
     for name in contents.pixels.extra:
-        pixels = np.moveaxis(contents.pixels.extra_rows(name, 0, height), -1, 0)
-        channels |= {
-            f"{name}.{c}": np.ascontiguousarray(plane) for c, plane in zip(COMPONENTS[name], pixels, strict=True)
-        }
+        names = [f"{name}.{component}" for component in COMPONENTS[name]]
+        channels |= zip(names, planes_of(contents.pixels.extra_rows(name, 0, height)), strict=True)
     return channels
 
 
-def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[Any]]) -> None:
-    """Add the channels of the HRLS that are neither fused nor dropped."""
-    file, names = contents.source, channel_names(contents)
+def _passed_on_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
+    """Return the channels of the HRLS that are neither fused nor dropped, (height, width) by name."""
+    names = channel_names(contents)
+    channels: dict[str, NDArray[Any]] = {}
     for part, passed_on in _passed_on(contents):
+        window = part.data_window
         for kind in sorted({channel.type for channel in passed_on}):
             for run in runs([channel for channel in passed_on if channel.type == kind]):
-                planes = [np.empty((part.data_window.height, part.data_window.width), DTYPES[kind]) for _ in run]
-                channels |= {names[c]: plane for c, plane in zip(run, planes, strict=True)}
-                for y0, y1, strip in file.native_strips(part, run[0].index, run[-1].index + 1):
+                planes = np.empty((len(run), window.height, window.width), DTYPES[kind])
+                channels |= zip([names[channel] for channel in run], planes, strict=True)
+                for y0, y1, strip in contents.source.native_strips(part, run[0].index, run[-1].index + 1):
                     if contents.replaced is not None:
-                        strip = contents.replaced.apply(run, y0 - part.data_window.y0, strip)
-                    for position, plane in enumerate(planes):
-                        plane[y0 - part.data_window.y0 : y1 - part.data_window.y0] = strip[..., position]
+                        strip = contents.replaced.apply(run, y0 - window.y0, strip)
+                    planes[:, y0 - window.y0 : y1 - window.y0] = np.moveaxis(strip, -1, 0)
+    return channels
 
 
 def _passed_on(contents: FileContents) -> Iterator[tuple[Part, list[Channel]]]:
@@ -143,7 +142,5 @@ def _header(contents: FileContents) -> dict[str, Any]:
         header.pop("view", None)
         header["multiView"] = list(views)
     name = "NO" if contents.compression == "none" else contents.compression.upper()
-    header["compression"] = getattr(OpenEXR, f"{name}_COMPRESSION")
-    header["type"] = OpenEXR.scanlineimage
-    header.update(contents.attributes)
-    return header
+    compression = getattr(OpenEXR, f"{name}_COMPRESSION")
+    return header | {"compression": compression, "type": OpenEXR.scanlineimage} | contents.attributes

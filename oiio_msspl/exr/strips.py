@@ -27,16 +27,13 @@ SMALLEST_FILE = 1 << 20
 
 
 class StripKey(NamedTuple):
-    """The channels and rows that a strip holds."""
+    """The channels, by their indices in the part, and the rows that a strip holds; ``last`` is exclusive."""
 
     path: Path
     part: int
     channels: tuple[int, ...]
-    """Indices of the channels in the part."""
     first: int
-    """First row."""
     last: int
-    """Last row, exclusive."""
 
 
 @dataclass
@@ -49,33 +46,28 @@ class StripCache:
 
     max_bytes: int = 0
     """Bytes that the strips may take together. With 0, nothing is kept."""
-    bytes: int = field(default=0, init=False)
-    """Bytes that the strips take in memory at the moment."""
-    _strips: dict[StripKey, NDArray[Any]] = field(default_factory=dict, repr=False)
-    _in_memory: set[StripKey] = field(default_factory=set, repr=False)
-    """Keys of the strips that are not in a temporary file."""
+    _in_memory: dict[StripKey, NDArray[Any]] = field(default_factory=dict, repr=False)
+    _spilled: dict[StripKey, NDArray[Any]] = field(default_factory=dict, repr=False)
+    """Strips in temporary files, and small ones that do not count."""
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that the strips take in memory at the moment."""
+        return sum(strip.nbytes for strip in self._in_memory.values())
 
     def get(self, key: StripKey) -> NDArray[Any] | None:
         """Return the strip, or None if it is not kept."""
-        return self._strips.get(key)
+        return self._in_memory.get(key)
 
     def pop(self, key: StripKey) -> NDArray[Any] | None:
         """Return the strip and forget it, or return None if it is not kept."""
-        strip = self._strips.pop(key, None)
-        if strip is not None and key in self._in_memory:
-            self._in_memory.remove(key)
-            self.bytes -= strip.nbytes
-        return strip
+        return (self._in_memory if key in self._in_memory else self._spilled).pop(key, None)
 
-    def keep(self, key: StripKey, strip: NDArray[Any]) -> None:
-        """Keep a strip if there is room."""
-        if self._has_room(strip):
-            self._strips[key] = strip
-            self._in_memory.add(key)
-            self.bytes += strip.nbytes
-
-    def _has_room(self, strip: NDArray[Any]) -> bool:
-        return self.bytes + strip.nbytes <= self.max_bytes
+    def keep(self, key: StripKey, strip: NDArray[Any], *, copy: bool = False) -> bool:
+        """Keep a strip, or a copy of it, if there is room; return whether there was."""
+        if has_room := self.bytes + strip.nbytes <= self.max_bytes:
+            self._in_memory[key] = strip.copy() if copy else strip
+        return has_room
 
     def keep_all(self, parts: Mapping[StripKey, NDArray[Any]]) -> None:
         """Keep copies of parts of a strip; those without room in one temporary file, or in memory if they are small.
@@ -83,32 +75,27 @@ class StripCache:
         Raises:
             MssplError: the disk has no room.
         """
-        spilled = {}
-        for key, part in parts.items():
-            if self._has_room(part):
-                self.keep(key, part.copy())
-            else:
-                spilled[key] = part
+        spilled = {key: part for key, part in parts.items() if not self.keep(key, part, copy=True)}
         if sum(part.nbytes for part in spilled.values()) < SMALLEST_FILE:
-            self._strips |= {key: part.copy() for key, part in spilled.items()}
+            self._spilled |= {key: part.copy() for key, part in spilled.items()}
             return
         ends = np.cumsum([part.size for part in spilled.values()])
         block = blank((int(ends[-1]),), next(iter(spilled.values())).dtype, on_disk=True)
         for (key, part), flat in zip(spilled.items(), np.split(block, ends[:-1]), strict=True):
-            self._strips[key] = flat.reshape(part.shape)
-            self._strips[key][:] = part
+            self._spilled[key] = flat.reshape(part.shape)
+            self._spilled[key][:] = part
         unload(block)
 
     def drop_outside(self, first: int, last: int) -> None:
         """Forget the strips that have none of the rows from ``first`` to ``last`` (exclusive)."""
-        for key in [key for key in self._strips if key.last <= first or key.first >= last]:
-            self.pop(key)
+        for key in [*self._in_memory, *self._spilled]:
+            if key.last <= first or key.first >= last:
+                self.pop(key)
 
     def clear(self) -> None:
         """Forget all strips."""
-        self._strips.clear()
         self._in_memory.clear()
-        self.bytes = 0
+        self._spilled.clear()
 
 
 def strip_rows(start: int, stop: int, origin: int, height: int, end: int) -> Iterator[tuple[int, int]]:

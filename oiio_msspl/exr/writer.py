@@ -62,10 +62,9 @@ def write_fused(
         beauty: channels R, G, B and perhaps A of the HRLS, which the fused frame replaces.
         rgb: scene linear, (height, width, 3), over the beauty's data window.
         alpha: (height, width, 1) if ``beauty`` has an A, otherwise None.
-        attributes: header attributes that are added to the beauty's part.
+        attributes, replaced: see :class:`FileContents`.
         options: layout, compression, pixel type and layers.
         extra: further layers, such as ``error``, see :attr:`FusedPixels.extra`.
-        replaced: new pixels for channels that are passed on, over the data window of their part.
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit waits in temporary
             files.
@@ -94,13 +93,9 @@ def write_fused(
 def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str]) -> None:
     """Check by the headers alone that the layout can hold what :func:`write_fused` would write.
 
-    Args:
-        source, beauty, options: as for :func:`write_fused`.
-        extra: names of further layers.
-
     Raises:
-        InputError: it can't; a further layer has the name of a layer of the HRLS; a pattern of ``options`` matches
-            nothing.
+        InputError: it can't; one of the further layers, ``extra``, has the name of a layer of the HRLS; a pattern of
+            ``options`` matches nothing.
     """
     contents = _without_pixels(source, beauty, options, extra)
     kept = {layer.name for channel, layer in contents.layers.items() if channel not in contents.dropped}
@@ -145,7 +140,7 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     writer = oiio.ImageOutput.create(str(path))
     if writer is None:
         raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
-    ok = writer.open(str(path), specs) if len(specs) > 1 else writer.open(str(path), beauty)
+    ok = writer.open(str(path), specs if len(specs) > 1 else beauty)
     ok = ok and _write_rows(writer, beauty, contents.pixels.rows)
     for name, spec in extra.items():
         ok = ok and writer.open(str(path), spec, "AppendSubimage")

@@ -16,7 +16,7 @@ from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.checks.pair import HrlsAverages, bounded_luminance, check_pair
 from oiio_msspl.fusion.passes.fuse import FusedPasses
-from oiio_msspl.fusion.tiles.alignment import Alignment, align
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
 from oiio_msspl.fusion.tiles.prepare import FramePair
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, memory_to_fuse, require_memory, strips_memory
@@ -92,16 +92,19 @@ def fuse(
     with limit_threads(session.threads):
         averages, aovs = HrlsAverages(alignment), session.clean_aovs if clean_aovs else ()
         pair = FramePair(lr, hr, alignment, session.contract, aovs, on_read=averages.add)
-        frame = _blank_frame(alignment, pair.exposure, error=error, half=half)
+        size = alignment.hr_data_window.height, alignment.hr_data_window.width
+        rgb: NDArray[Any] = blank((*size, 3), np.float16 if half else np.float32, on_disk=False)
+        errors: Array | None = blank((*size, 1), on_disk=False) if error else None
+        frame = FusedFrame(rgb, None, errors, alignment, pair.exposure, {})
         with hr.cache_strips(strips_memory(max_memory, held)):
-            for _, number, count in fuse_tiles(tile_tasks(pair, frame), session):
-                frame.tiles = count
+            for task in fuse_tiles(tile_tasks(pair, frame), session):
+                frame.tiles = task.count
                 for image in frame.clean_aovs.values():
                     unload(image)
                 for render in (lr, hr):
                     render.unload()
                 if progress is not None:
-                    progress(number, count)
+                    progress(task.number, task.count)
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb
@@ -128,17 +131,9 @@ def check_model(session: Session, scale: int, *, error: bool) -> None:
         raise InputError(f"model {name} is for x{session.contract.scale}, but this pair is x{scale}{hint}")
 
 
-def _blank_frame(alignment: Alignment, exposure: float, *, error: bool, half: bool) -> FusedFrame:
-    size = (alignment.hr_data_window.height, alignment.hr_data_window.width)
-    errors: Array | None = blank((*size, 1), on_disk=False) if error else None
-    rgb: NDArray[Any] = blank((*size, 3), np.float16 if half else np.float32, on_disk=False)
-    return FusedFrame(rgb, None, errors, alignment, exposure, {})
-
-
 def _lost_aovs(frame: FusedFrame) -> list[str]:
     """Return a sentence for each AOV of the HRLS that is broken in most of its values."""
-    pixels = frame.rgb.shape[0] * frame.rgb.shape[1]
-    broken = {name: frame.repaired.get(f"hrls.{name}", 0) / (3 * pixels) for name in (ALBEDO, NORMAL)}
+    broken = {name: frame.repaired.get(f"hrls.{name}", 0) / frame.rgb.size for name in (ALBEDO, NORMAL)}
     return [
         f"{fraction:.0%} of the HRLS's {name} is NaN or infinite, so it tells little of the surfaces; render it again"
         for name, fraction in broken.items()

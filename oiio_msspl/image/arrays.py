@@ -91,11 +91,7 @@ def reserve(file: IO[bytes], size: int) -> None:
 
 
 def kept(values: NDArray[T], *, on_disk: bool | None = None) -> NDArray[T]:
-    """Return an image that waits for other images: itself, or a copy in a temporary file.
-
-    Args:
-        on_disk: True for a temporary file, False for memory, None to decide by :func:`has_many_pixels`.
-    """
+    """Return an image that waits for other images: itself, or a copy in a file if :func:`blank` would use one."""
     if not (has_many_pixels(*values.shape[:2]) if on_disk is None else on_disk) or _file_of(values) is not None:
         return values
     copy = blank(values.shape, values.dtype, on_disk=True, interleaved=values.strides[-1] == values.itemsize)
@@ -105,10 +101,7 @@ def kept(values: NDArray[T], *, on_disk: bool | None = None) -> NDArray[T]:
 
 
 def unload(values: NDArray[Any]) -> None:
-    """Give the memory of an image in a temporary file back to the system. The file keeps its pixels.
-
-    An image in memory is left alone.
-    """
+    """Give the memory of an image in a temporary file back to the system; an image in memory is left alone."""
     file = _file_of(values)
     if file is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
         file.madvise(mmap.MADV_DONTNEED)
@@ -122,21 +115,11 @@ def _file_of(values: NDArray[Any]) -> mmap.mmap | None:
     return owner if isinstance(owner, mmap.mmap) else None
 
 
-def map_rows(function: Callable[[Array], object], source: Array, out: Array | None = None) -> Array:
-    """Apply an in-place, per-value function to a float32 copy of an image.
-
-    Args:
-        function: changes a block of rows in place.
-        source: (height, ...).
-        out: gets the result; a new array if None.
-
-    Returns:
-        The result, in the shape of ``source``.
-    """
-    result = np.empty(np.shape(source), np.float32) if out is None else out
+def map_rows(function: Callable[[Array], object], source: Array) -> Array:
+    """Return a float32 copy of an image (height, ...), whose blocks of rows ``function`` has changed in place."""
+    result = np.empty(source.shape, np.float32)
 
     def work(rows: slice) -> None:
-        # The copy keeps the memory layout of the source. That of the result may differ.
         block = np.array(source[rows], np.float32)
         function(block)
         result[rows] = block
@@ -145,9 +128,9 @@ def map_rows(function: Callable[[Array], object], source: Array, out: Array | No
     return result
 
 
-def clip(values: Array, lowest: float, highest: float, out: Array | None = None) -> Array:
+def clip(values: Array, lowest: float, highest: float) -> Array:
     """Clip values to a range, as ``np.clip``, on all cores."""
-    return map_rows(lambda block: np.clip(block, lowest, highest, out=block), values, out)
+    return map_rows(lambda block: np.clip(block, lowest, highest, out=block), values)
 
 
 def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bool_] | None]:
@@ -158,16 +141,9 @@ def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bo
     Returns:
         The repaired values and a mask of the changed ones; the input itself and None if none was changed.
     """
-    bounds: list[tuple[Any, Any]] = []
-
-    def work(rows: slice) -> None:
-        block = values[rows]
-        bounds.append((block.min(), block.max()))
-
-    if values.size:
-        for_row_blocks(work, len(values), values[0].size)
-        if np.isfinite(bounds).all() and (signed or min(bounds)[0] >= 0):
-            return values, None
+    bounds = (values.min(), values.max()) if values.size else (0, 0)
+    if np.isfinite(bounds).all() and (signed or bounds[0] >= 0):
+        return values, None
     bad = ~np.isfinite(values)
     if not signed:
         bad |= values < 0

@@ -95,19 +95,13 @@ def conversion(source: ColourSpace, target: ColourSpace) -> NDArray[np.float64]:
     """Return the matrix (3, 3) for ``rgb @ matrix.T``, linear RGB. White stays white (Bradford adaptation)."""
     to_cones = []
     for space in (source, target):
-        matrix = _rgb_to_xyz(space.chromaticities)
-        cones = _BRADFORD @ matrix
-        to_cones.append(cones / (_BRADFORD @ matrix.sum(axis=1))[:, None])
+        xy = np.reshape(space.chromaticities, (4, 2))
+        xyz = np.column_stack([xy, 1 - xy.sum(axis=1)]) / xy[:, 1:]
+        primaries = xyz[:3].T
+        # Linear RGB to CIE XYZ, for a white of Y = 1 (SMPTE RP 177).
+        matrix = primaries * np.linalg.solve(primaries, xyz[3])
+        to_cones.append(_BRADFORD @ matrix / (_BRADFORD @ matrix.sum(axis=1))[:, None])
     return np.linalg.solve(to_cones[1], to_cones[0])
-
-
-def _rgb_to_xyz(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return the matrix from linear RGB to CIE XYZ, for a white of Y = 1 (SMPTE RP 177)."""
-    xy = np.array(chromaticities, dtype=np.float64).reshape(4, 2)
-    xyz = np.column_stack([xy, 1 - xy.sum(axis=1)]) / xy[:, 1:]
-    primaries = xyz[:3].T
-    matrix: NDArray[np.float64] = primaries * np.linalg.solve(primaries, xyz[3])
-    return matrix
 
 
 def named_space(name: str) -> ColourSpace | None:
@@ -119,10 +113,8 @@ def named_space(name: str) -> ColourSpace | None:
     for space in SPACES:
         if wanted in (space.name, *space.aliases):
             return space
-    if not wanted:
-        return None
-    config = oiio.ColorConfig()
-    return next((space for space in SPACES if config.equivalent(name, space.name)), None)
+    config = oiio.ColorConfig() if wanted else None
+    return next((space for space in SPACES if config and config.equivalent(name, space.name)), None)
 
 
 def space_of(metadata: Mapping[str, Any]) -> ColourSpace | None:
@@ -133,13 +125,10 @@ def space_of(metadata: Mapping[str, Any]) -> ColourSpace | None:
     """
     values = metadata.get("chromaticities")
     if isinstance(values, tuple) and len(values) == 8 and all(isinstance(v, float) and np.isfinite(v) for v in values):
-        chromaticities: tuple[float, ...] = values
-        for space in SPACES:
-            if _alike(chromaticities, space.chromaticities):
-                return space
-        degenerate = min(abs(v) for v in values[1::2]) < 1e-6 or abs(np.linalg.det(_edges(values))) < 1e-4
-        name = f"the space with the chromaticities {', '.join(f'{value:.4g}' for value in values)}"
-        return None if degenerate else ColourSpace(name, chromaticities)
+        stored = ColourSpace(f"the space with the chromaticities {', '.join(f'{v:.4g}' for v in values)}", values)
+        red, green, blue, _ = np.reshape(values, (4, 2))
+        degenerate = min(abs(v) for v in values[1::2]) < 1e-6 or abs(np.linalg.det([green - red, blue - red])) < 1e-4
+        return next((space for space in SPACES if same_space(stored, space)), None if degenerate else stored)
     name = str(metadata.get("oiio:ColorSpace") or "")
     return None if name.lower() in _INDEFINITE else named_space(name)
 
@@ -162,14 +151,4 @@ def encoding_of(metadata: Mapping[str, Any]) -> str:
 
 def same_space(first: ColourSpace, second: ColourSpace) -> bool:
     """Return whether two spaces are equal, except for the rounding of headers."""
-    return _alike(first.chromaticities, second.chromaticities)
-
-
-def _alike(first: tuple[float, ...], second: tuple[float, ...]) -> bool:
-    return bool(np.allclose(first, second, rtol=0, atol=_SAME))
-
-
-def _edges(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return two edges (2, 2) of the triangle of the primaries."""
-    red, green, blue = np.array(chromaticities, dtype=np.float64).reshape(4, 2)[:3]
-    return np.stack([green - red, blue - red])
+    return bool(np.allclose(first.chromaticities, second.chromaticities, rtol=0, atol=_SAME))

@@ -37,14 +37,9 @@ def box_downsample(image: NDArray[Any], scale: int) -> Array:
 
 
 def interpolate(values: Array, positions: NDArray[np.float64], axis: int) -> Array:
-    """Sample an image linearly along one axis, at positions between pixels. The edge pixel is repeated outside.
+    """Sample an image (height, width, ...) linearly at positions between pixels along an axis, in pixels.
 
-    Args:
-        values: (height, width, ...).
-        positions: pixel indices along ``axis``, one for each pixel of the result.
-
-    Returns:
-        The samples; the image itself if the positions are exactly its pixels.
+    The edge pixel is repeated outside. If the positions are exactly the pixels, the image itself is returned.
     """
     last = values.shape[axis] - 1
     if np.array_equal(positions, np.arange(last + 1)):
@@ -143,26 +138,27 @@ def max_3x3(values: Array) -> Array:
 def sum_3x3(values: Array) -> Array:
     """Return the sum of the 3 x 3 values around each pixel, (h, w, ...). The edge pixel is repeated."""
     for axis in (1, 0):
-        lines = values.swapaxes(0, axis)
-        total = lines.copy(order="K")
-        for pixels, beside in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None)), ((0,), (0,)), ((-1,), (-1,))):
-            total[pixels] += lines[beside]
-        values = total.swapaxes(0, axis)
+        values = _sum_of_three(values, axis, 1)
     return values
 
 
 def blurred(plane: Array, times: int = 1) -> Array:
     """Blur a plane (h, w) with the weights 1, 2, 1 in rows and in columns, repeatedly. The edge pixel is repeated."""
     for axis in (0, 1) * times:
-        lines = plane.swapaxes(0, axis)
-        total = 2 * lines
-        total[1:] += lines[:-1]
-        total[:-1] += lines[1:]
-        total[0] += lines[0]
-        total[-1] += lines[-1]
-        total *= np.float32(1 / 4)
-        plane = total.swapaxes(0, axis)
+        plane = _sum_of_three(plane, axis, 2)
+        plane *= np.float32(1 / 4)
     return plane
+
+
+def _sum_of_three(values: Array, axis: int, weight: int) -> Array:
+    """Return each pixel, times ``weight``, plus those on both sides of it along an axis."""
+    lines = values.swapaxes(0, axis)
+    total = weight * lines
+    total[1:] += lines[:-1]
+    total[:-1] += lines[1:]
+    total[0] += lines[0]
+    total[-1] += lines[-1]
+    return total.swapaxes(0, axis)
 
 
 def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
@@ -174,41 +170,19 @@ def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
     """
     height, width = plane.shape
     sums = np.zeros((height + 1, width + 1))
-
-    def add_columns(rows: slice) -> None:
-        np.cumsum(plane[rows], axis=1, out=sums[1:, 1:][rows])
-
-    def add_rows(columns: slice) -> None:
-        for row in range(1, height):  # twice as fast as a cumulative sum along the first axis
-            sums[row + 1, columns] += sums[row, columns]
-
-    for_row_blocks(add_columns, height, 2 * width)
-    for_row_blocks(add_rows, width + 1, 2 * height)
-    return [_mean_of_sums(sums, reach) for reach in reaches]
-
-
-def _mean_of_sums(sums: NDArray[np.float64], reach: int) -> Array:
-    """Return the means (h, w) for one reach. ``sums`` (h + 1, w + 1): of all values above and to the left."""
-    height, width = (size - 1 for size in sums.shape)
-    (top, bottom), (left, right) = (
-        (np.maximum(np.arange(size) - reach, 0), np.minimum(np.arange(size) + reach + 1, size))
-        for size in (height, width)
-    )
-    result = np.empty((height, width), np.float32)
+    np.cumsum(np.cumsum(plane, axis=1, dtype=np.float64), axis=0, out=sums[1:, 1:])
+    results = [np.empty((height, width), np.float32) for _ in reaches]
 
     def work(rows: slice) -> None:
-        lines = sums.take(bottom[rows], axis=0)
-        lines -= sums.take(top[rows], axis=0)
-        squares = np.empty((len(lines), width))
-        if width > 2 * reach:  # slices are read much faster than by index
-            inside = slice(reach, width - reach)
-            np.subtract(lines[:, 2 * reach + 1 :], lines[:, : width - 2 * reach], out=squares[:, inside])
-            squares[:, :reach] = lines[:, reach + 1 : 2 * reach + 1]
-            squares[:, width - reach :] = lines[:, -1:] - lines[:, width - 2 * reach : width - reach]
-        else:
-            np.subtract(lines.take(right, axis=1), lines.take(left, axis=1), out=squares)
-        squares *= 1 / (right - left)
-        np.multiply(squares, 1 / (bottom - top)[rows, None], out=result[rows], casting="same_kind")
+        for reach, result in zip(reaches, results, strict=True):
+            (top, bottom), (left, right) = (
+                (np.maximum(positions - reach, 0), np.minimum(positions + reach + 1, size))
+                for positions, size in ((np.arange(rows.start, rows.stop), height), (np.arange(width), width))
+            )
+            lines = sums.take(bottom, axis=0) - sums.take(top, axis=0)
+            squares = lines.take(right, axis=1) - lines.take(left, axis=1)
+            squares *= 1 / (right - left)
+            np.multiply(squares, 1 / (bottom - top)[:, None], out=result[rows], casting="same_kind")
 
     for_row_blocks(work, height, 4 * width)
-    return result
+    return results

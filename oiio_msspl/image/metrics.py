@@ -31,9 +31,7 @@ def psnr(image: Array, reference: Array) -> float:
 def relmse_map(image: Array, reference: Array, convention: tuple[float, float] = RELMSE_BCR) -> NDArray[np.float64]:
     """Compute the relative squared error of each value, ``lambda_1 (I - R)^2 / (R^2 + lambda_2)``: (height, width, 3).
 
-    Args:
-        image, reference: I and R, scene linear.
-        convention: (lambda_1, lambda_2).
+    ``image`` is I, ``reference`` R, and ``convention`` (lambda_1, lambda_2).
     """
     first, second = convention
     truth = reference.astype(np.float64)

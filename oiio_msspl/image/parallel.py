@@ -35,11 +35,7 @@ _thread_limit: ContextVar[int] = ContextVar("thread_limit", default=0)
 
 @contextlib.contextmanager
 def limit_threads(count: int) -> Iterator[None]:
-    """Use at most ``count`` threads inside of the ``with`` block; 0 means one for each available core.
-
-    Raises:
-        InputError: see :func:`check_threads`.
-    """
+    """Use at most ``count`` threads inside of the ``with`` block; 0 means one for each available core."""
     check_threads(count)
     token = _thread_limit.set(count)
     try:
@@ -49,11 +45,7 @@ def limit_threads(count: int) -> Iterator[None]:
 
 
 def check_threads(count: int) -> None:
-    """Check a number of threads that the caller asks for.
-
-    Raises:
-        InputError: it is below 0, or so large that the system could run out of threads.
-    """
+    """Raise InputError if a number of threads is below 0, or so large that the system could run out of threads."""
     if not 0 <= count <= MOST_THREADS:
         raise InputError(f"--threads {count}: give a number from 0, which means one a core, to {MOST_THREADS}")
 
@@ -92,10 +84,9 @@ def for_row_blocks(work: Callable[[slice], object], rows: int, row_size: int, mu
 
 
 def in_background(work: Callable[[], T]) -> Callable[[], T]:
-    """Start ``work`` on another thread.
+    """Start ``work`` on another thread, and return a function that waits for its result.
 
-    Returns:
-        A function that waits for the result and returns it; ``work`` itself, not started, if one thread may be used.
+    If only one thread may be used, that function is ``work`` itself, not started.
     """
     return work if _one_thread() else _start(work).result
 
@@ -127,13 +118,7 @@ def two_at_a_time(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
             for i in waiting:
                 results[i] = work(items[i])
 
-    pending = submit(_pool("second"), take)
-    try:
-        take()
-    finally:
-        error = pending.exception()
-    if error is not None:
-        raise error
+    in_parallel(take, take)
     return [results[i] for i in range(len(items))]
 
 
@@ -197,8 +182,7 @@ def end_pools() -> None:
         _pools.pop(key).shutdown(wait=False)
 
 
-#: Pools by name: for rows, one for each number of threads; for work in the background; and for every second item of
-#: :func:`two_at_a_time`.
+#: Pools by name: for rows, one for each number of threads; and for work in the background.
 _pools: dict[str, ThreadPoolExecutor] = {}
 
 

@@ -87,12 +87,10 @@ def sample_cubic(
 
 
 class _Cubic:
-    """Keys' cubic at some positions of planes.
+    """Keys' cubic at positions that lie ``right`` and ``down`` (0 to 1) beyond a pixel.
 
-    Args:
-        right, down: how far the positions lie beyond a pixel, from 0 to 1.
-        first: flat indices of the pixels above and to the left of that one.
-        stride: pixels in a row of a plane.
+    ``first`` are the flat indices of the pixels above and to the left of that one, in planes of rows of ``stride``
+    pixels.
     """
 
     def __init__(self, right: Array, down: Array, first: NDArray[np.intp], stride: int) -> None:

@@ -17,7 +17,7 @@ from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.memory import memory_to_write
-from oiio_msspl.jobs.model_choice import resolve_auto
+from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.run import ShotRun
@@ -88,7 +88,7 @@ def fuse_files(
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     alignment = align(frame.lr, frame.hr)
     if memory_to_write(alignment, frame.hr, write) <= max_memory:
-        run.settings = replace(settings, model=resolve_auto(frame.lr, frame.hr, model))
+        run.settings = replace(settings, model=choose_model(frame.lr, frame.hr, model, frame.read_if_small)[0])
     run.settings.session(alignment.scale)
     opened = time.perf_counter()
     for settled in run.take(views):

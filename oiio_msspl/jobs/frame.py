@@ -18,7 +18,7 @@ from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.source import MotionFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.image.arrays import Array, Mask, kept
-from oiio_msspl.jobs.memory import ViewMemory
+from oiio_msspl.jobs.memory import ViewMemory, is_large
 from oiio_msspl.jobs.passes import Progress
 from oiio_msspl.jobs.plan import ViewPlan
 from oiio_msspl.jobs.report import FrameReport
@@ -151,6 +151,16 @@ class ShotFrame:
         if isinstance(self.error, InputError):
             raise self.error
         raise MssplError(f"frame {self.number}, its neighbour, has failed: {explain(self.error)[0]}") from self.error
+
+    def read_if_small(self) -> RenderPair:
+        """Return the renders. Those of a small frame are read into memory, so that they are decoded once.
+
+        Raises:
+            InputError: pixels can't be decoded.
+        """
+        if self.renders.hr is self.stored[1] and not is_large(self.hr):
+            self.renders = RenderPair(self.stored[0].load(), self.stored[1].load())
+        return self.renders
 
     def motion_frame(self) -> MotionFrame:
         """Return what is needed to follow its surfaces."""

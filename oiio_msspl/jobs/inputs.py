@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from oiio_msspl.aovs.candidates import mapped_files
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
@@ -58,7 +58,14 @@ class InputOptions:
         return mapped_files(self.mapping, hr_path) | {path for path in named if path is not None}
 
 
-def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> tuple[MappedRender, MappedRender]:
+class MappedPair(NamedTuple):
+    """Both renders of a frame, mapped for one view or view layer."""
+
+    lr: MappedRender
+    hr: MappedRender
+
+
+def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> MappedPair:
     """Open both files and map their layers to features.
 
     Args:
@@ -86,12 +93,10 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
             f"choose one that both have with --view-layer, such as {lr.view!r}"
         )
     lr.space = hr.space = _common_space(lr, hr, inputs.colourspace)
-    return lr, hr
+    return MappedPair(lr, hr)
 
 
-def map_other_view(
-    lr: MappedRender, hr: MappedRender, view: str, inputs: InputOptions
-) -> tuple[MappedRender, MappedRender]:
+def map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputOptions) -> MappedPair:
     """Map a pair for another view or view layer.
 
     Args:
@@ -106,7 +111,7 @@ def map_other_view(
     if low.view != view:
         raise InputError(f"{lr.name}: has no view or view layer {view!r}")
     low.space = high.space = hr.space
-    return low, high
+    return MappedPair(low, high)
 
 
 def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedRender:

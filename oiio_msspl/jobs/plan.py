@@ -20,7 +20,7 @@ from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
-from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, MappedPair, map_other_hrls, map_pair
 from oiio_msspl.jobs.model_choice import family_for_layers
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline, neighbours
@@ -28,9 +28,6 @@ from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of
 
 log = logging.getLogger(__name__)
-
-#: LRHS and HRLS.
-Pair = tuple[MappedRender, MappedRender]
 
 #: Words that ``--temporal`` takes in place of a number.
 AUTO, OFF = "auto", "off"
@@ -176,7 +173,7 @@ def plan_temporal(
     return ShotPlan(frames, views, text, frozenset(labels))
 
 
-def _family_of_shot(mapped: Callable[[int], Pair], numbers: Iterable[int], model: str | None) -> str | None:
+def _family_of_shot(mapped: Callable[[int], MappedPair], numbers: Iterable[int], model: str | None) -> str | None:
     """Return the family of models that suits the first pair's layers; ``model`` itself if it names no family."""
     family = family_of(model)
     if family is None:
@@ -197,7 +194,7 @@ def _plan_view(source: MotionSource, count: int, *, asked: bool) -> tuple[ViewPl
 
 
 def _other_views(
-    mapped: Callable[[int], Pair], numbers: Sequence[int], inputs: InputOptions, write: WriteOptions
+    mapped: Callable[[int], MappedPair], numbers: Sequence[int], inputs: InputOptions, write: WriteOptions
 ) -> list[str]:
     """Return the views beside the first one that are fused in some of these frames."""
     views: dict[str, None] = {}
@@ -216,7 +213,7 @@ def reach_of(count: int, kind: str) -> Reach:
 
 
 def _motion_of(
-    mapped: Callable[[int], Pair],
+    mapped: Callable[[int], MappedPair],
     numbers: Iterable[int],
     inputs: InputOptions,
     options: TemporalOptions,

@@ -29,6 +29,7 @@ from oiio_msspl.fusion.tiles.tiling import require_memory
 from oiio_msspl.image.arrays import kept
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State
+from oiio_msspl.jobs.inputs import MappedPair
 from oiio_msspl.jobs.memory import check_frame_memory, is_large, light_features
 from oiio_msspl.jobs.passes import Progress, fuse_frame_passes, steps_of, uses_clean_aovs
 from oiio_msspl.jobs.plan import ShotPlan
@@ -37,7 +38,7 @@ from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, writ
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key
-from oiio_msspl.jobs.views import View, store_view
+from oiio_msspl.jobs.views import store_view
 
 
 class ShotRun:
@@ -118,7 +119,7 @@ class ShotRun:
                 frame.lr, frame.hr, frame.session, frame.write, self.settings.max_memory, frame.held_bytes
             )
             before, after = self._hops_of_renders(frame) if frame.plan.reach.renders else ([], [])
-            frame.averaged = frame.renders
+            frame.averaged = frame.read_if_small() if self._only_frame else frame.renders
             if before or after:
                 _replace_by_means(frame, before, after)
             frame.state = State.AVERAGED
@@ -155,7 +156,7 @@ class ShotRun:
         """Fuse the passes of a view, and store it among the channels that all views of a frame replace."""
         picture.replaced = first.replaced = first.replaced or ReplacedChannels()
         self._fuse_passes(view, picture)
-        view.report = store_view(View(view.lr, view.hr), picture, view.session)
+        view.report = store_view(MappedPair(view.lr, view.hr), picture, view.session)
 
     def fuse(self, frame: ShotFrame) -> FusedFrame:
         """Fuse the averaged renders of a frame."""

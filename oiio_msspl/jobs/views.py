@@ -8,7 +8,6 @@ file just before the first view: memory holds one such view at a time.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender
@@ -20,7 +19,7 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import HALF_MAX
-from oiio_msspl.jobs.inputs import InputOptions, map_other_view
+from oiio_msspl.jobs.inputs import InputOptions, MappedPair, map_other_view
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.model.session import Session
 
@@ -28,18 +27,11 @@ from oiio_msspl.model.session import Session
 ROWS_PER_PUT = 256
 
 
-class View(NamedTuple):
-    """A pair, mapped for one view or view layer."""
-
-    lr: MappedRender
-    hr: MappedRender
-
-
 @dataclass(frozen=True)
 class OtherViews:
     """The views of a pair beside the first one."""
 
-    views: tuple[View, ...] = ()
+    views: tuple[MappedPair, ...] = ()
     """Those that are fused."""
     passed_on: tuple[str, ...] = ()
     """Why others are not, and which beauties are not written, one sentence each."""
@@ -71,7 +63,7 @@ def find_other_views(
     views, passed_on = [], []
     for label in hr.other_views:
         try:
-            view = View(*map_other_view(lr, hr, label, inputs))
+            view = map_other_view(lr, hr, label, inputs)
             if align(view.lr, view.hr).scale != scale:
                 raise InputError(f"the pair is x{align(view.lr, view.hr).scale} here and x{scale} in {hr.view}")
             if not taken.isdisjoint(view.hr.beauty_channels):
@@ -100,7 +92,7 @@ def _channels_of_set(additive_set: AdditiveSet) -> set[object]:
     return {channel for layer in additive_set.layers for channel in layer.channels}
 
 
-def store_view(view: View, fused: FusedFrame, session: Session) -> FrameReport:
+def store_view(view: MappedPair, fused: FusedFrame, session: Session) -> FrameReport:
     """Put a fused view beside the first one where its passes are, in ``fused.replaced``, and report on it."""
     assert fused.replaced is not None
     _store(fused.replaced, view.hr, fused)

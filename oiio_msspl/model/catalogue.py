@@ -99,11 +99,7 @@ def find_model(scale: int, name: str | None = None) -> Path:
 
 
 def load_model(scale: int, name: str | None = None, device: str = "cpu", threads: int = 0) -> Session:
-    """Load a model.
-
-    Args:
-        scale, name: see :func:`find_model`.
-        device, threads: see :class:`oiio_msspl.model.session.Session`.
+    """Load a model of :func:`find_model` as a :class:`oiio_msspl.model.session.Session`.
 
     Raises:
         InputError: there is no such model, or it can't run on this device.

@@ -34,13 +34,7 @@ FORMAT = 2
 
 def current_transforms() -> dict[str, Any]:
     """Return the constants of :mod:`oiio_msspl.model.encoding`, as the contract records them."""
-    return {
-        "curve": "log1p",
-        "mu": MU,
-        "key": KEY,
-        "max_radiance": MAX_RADIANCE,
-        "max_albedo": MAX_ALBEDO,
-    }
+    return {"curve": "log1p", "mu": MU, "key": KEY, "max_radiance": MAX_RADIANCE, "max_albedo": MAX_ALBEDO}
 
 
 @dataclass(frozen=True)
@@ -99,12 +93,7 @@ class Contract:
 
     def _wrong_field(self) -> str | None:
         """Return the name of a field whose value has a wrong type or is out of range; None if all are valid."""
-        numbers = {
-            "scale": (1, 64),
-            "alignment": (1, 1024),
-            "overlap": (0, 4096),
-            "bytes_per_pixel": (1, 10**6),
-        }
+        numbers = {"scale": (1, 64), "alignment": (1, 1024), "overlap": (0, 4096), "bytes_per_pixel": (1, 10**6)}
         for name, (least, most) in numbers.items():
             value = getattr(self, name)
             if type(value) is not int or not least <= value <= most:
@@ -141,14 +130,7 @@ class Contract:
 
     @classmethod
     def of_network(cls, network: Network, path: str | Path) -> Contract:
-        """Read the contract of a loaded network.
-
-        Args:
-            path: the file that errors name.
-
-        Raises:
-            InputError: no contract that fits this version.
-        """
+        """Read the contract of a loaded network, as :meth:`of_file` does; ``path`` is for messages."""
         metadata = network.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
             raise InputError(
@@ -158,37 +140,23 @@ class Contract:
 
     @classmethod
     def from_json(cls, text: str, source: str) -> Contract:
-        """Read a contract.
-
-        Args:
-            source: the file that errors name.
-
-        Raises:
-            InputError: the text is no contract, or does not fit this version.
-        """
+        """Read a contract, or raise InputError if it does not fit this version; ``source`` is for messages."""
+        again = "export it again"
         try:
             contract = cls(**json.loads(text))
         except (ValueError, TypeError, RecursionError) as error:
-            raise InputError(
-                f"{source}: the '{METADATA_KEY}' metadata can't be read ({error}); export it again"
-            ) from error
+            raise InputError(f"{source}: the '{METADATA_KEY}' metadata can't be read ({error}); {again}") from error
         if contract.format != FORMAT:
             version = str(contract.format)[:20]
             raise InputError(f"{source}: contract format {version}, this version reads {FORMAT}; update one of them")
-        wrong = contract._wrong_field()
-        if wrong:
-            raise InputError(f"{source}: the field {wrong} of its contract has a value that can't be; export it again")
+        if wrong := contract._wrong_field():
+            raise InputError(f"{source}: the field {wrong} of its contract has a value that can't be; {again}")
         for key, value in {"transforms": current_transforms(), "defaults": DEFAULTS}.items():
-            if getattr(contract, key) != value:
-                raise InputError(
-                    f"{source}: made for {key} {str(getattr(contract, key))[:200]}, this version has {value}; "
-                    "export it again"
-                )
+            if (stored := getattr(contract, key)) != value:
+                raise InputError(f"{source}: made for {key} {str(stored)[:200]}, this version has {value}; {again}")
         if contract.overlap % contract.alignment:
-            raise InputError(
-                f"{source}: an overlap of {contract.overlap} is no multiple of its alignment, {contract.alignment}; "
-                "export it again"
-            )
+            multiple = f"an overlap of {contract.overlap} is no multiple of its alignment, {contract.alignment}"
+            raise InputError(f"{source}: {multiple}; {again}")
         if contract.scale not in (1, *SCALES):
             raise InputError(f"{source}: scale {contract.scale} is none of {(1, *SCALES)}")
         return contract

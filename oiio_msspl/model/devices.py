@@ -72,30 +72,21 @@ def _is_installed(package: str) -> bool:
 
 def providers(device: str) -> list[Provider]:
     """Return the execution providers of a device with their settings. The first that supports an operator runs it."""
+    settings = {
+        # Without these, OpenVINO uses the CPU, and GPUs compute the log curve in half floats, which overflow.
+        "openvino": {"device_type": "AUTO:GPU,CPU", "precision": "ACCURACY"},
+        # The older format, NeuralNetwork, has fewer operators.
+        "coreml": {"ModelFormat": "MLProgram"},
+    }
     if device == "tensorrt":
         # Building an engine takes minutes, so it is stored for the next run.
-        settings = {
-            "trt_engine_cache_enable": "1",
-            "trt_engine_cache_path": str(_cache_folder("tensorrt")),
-            "trt_timing_cache_enable": "1",
-        }
-        return [(PROVIDERS[device], settings), (PROVIDERS["cuda"], {}), (CPU, {})]
-    first: dict[str, list[Provider]] = {
-        "cpu": [],
-        # Without these, OpenVINO uses the CPU, and GPUs compute the log curve in half floats, which overflow.
-        "openvino": [(PROVIDERS["openvino"], {"device_type": "AUTO:GPU,CPU", "precision": "ACCURACY"})],
-        # The older format, NeuralNetwork, has fewer operators.
-        "coreml": [(PROVIDERS["coreml"], {"ModelFormat": "MLProgram"})],
-    }
-    return [*first.get(device, [(PROVIDERS[device], {})]), (CPU, {})]
-
-
-def _cache_folder(name: str) -> Path:
-    """Make a folder for files that can be made again."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-    folder = Path(base, "oiio_msspl", name)
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+        base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+        folder = Path(base, "oiio_msspl", "tensorrt")
+        folder.mkdir(parents=True, exist_ok=True)
+        settings[device] = {"trt_engine_cache_enable": "1", "trt_timing_cache_enable": "1"}
+        settings[device]["trt_engine_cache_path"] = str(folder)
+    names = {"tensorrt": ["tensorrt", "cuda"], "cpu": []}.get(device, [device])
+    return [*((PROVIDERS[name], settings.get(name, {})) for name in names), (CPU, {})]
 
 
 def gpu_file(path: Path) -> Path | None:

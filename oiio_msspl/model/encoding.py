@@ -85,13 +85,8 @@ def _log_mean(lit: Array) -> float:
     return float(np.exp(log_sum / lit.size))
 
 
-def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) -> Array:
-    """Log-encode scene-linear radiance: ``log(1 + MU e x) / log(1 + MU)``, with ``e x`` clipped to [0, MAX_RADIANCE].
-
-    Args:
-        radiance: any shape.
-        out: gets the result; a new array if None.
-    """
+def encode_radiance(radiance: Array, exposure: float) -> Array:
+    """Log-encode scene-linear radiance: ``log(1 + MU e x) / log(1 + MU)``, ``e x`` clipped to [0, MAX_RADIANCE]."""
 
     def encode(values: Array) -> None:
         with np.errstate(over="ignore"):  # values that overflow are clipped
@@ -101,7 +96,7 @@ def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) 
         _log1p(values)
         values *= _LOG_SCALE
 
-    return map_rows(encode, radiance, out)
+    return map_rows(encode, radiance)
 
 
 def decode_radiance(encoded: Array, exposure: float) -> Array:

@@ -50,30 +50,22 @@ def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float) -> Shar
     def high(name: str) -> Array:
         return np.stack([box_downsample(_comparable(name, hrls[name]), scale) for _, hrls in pairs])
 
-    lrhs, hrls = (encode_radiance(images, exposure) for images in (low(RGB), high(RGB)))
-    share = lrhs_share(lrhs, hrls)
+    share = lrhs_share(*(encode_radiance(images, exposure) for images in (low(RGB), high(RGB))))
     shared = set(pairs[0][0]) & set(pairs[0][1])
     return {RGB: share} | {name: share for name in (ALBEDO, NORMAL) if name in shared and _agree(low(name), high(name))}
 
 
 def _comparable(name: str, image: Array) -> Array:
     """Clip a feature to the range in which the models average it."""
-    if name == RGB:
-        return image
-    return clip(image, 0.0 if name == ALBEDO else -1.0, 1.0)
+    return image if name == RGB else clip(image, 0.0 if name == ALBEDO else -1.0, 1.0)
 
 
 def lrhs_share(lrhs: Array, hrls: Array) -> float:
-    """Return the share of the LRHS in the mean of both renders that has the least noise.
+    """Return the share of the LRHS in the mean of both renders that has the least noise, in [0.05, 0.95].
 
-    High-pass filtered, each render is picture plus noise. The picture is the same in both and the noise is independent,
-    so their covariance is the variance of the picture. The rest of each render's variance is noise.
-
-    Args:
-        lrhs, hrls: (..., h, w, 3), log-encoded, at one resolution.
-
-    Returns:
-        A share in [0.05, 0.95]; 0.5 if both are equally noisy, or not noisy.
+    It is 0.5 if both are equally noisy, or not noisy. Both are log-encoded, (..., h, w, 3), at one resolution.
+    High-pass filtered, each is picture plus noise. The picture is the same in both and the noise is independent, so
+    their covariance is the variance of the picture. The rest of each render's variance is noise.
     """
     a, b = (x[..., 1:, 1:, :] - x[..., 1:, :-1, :] - x[..., :-1, 1:, :] + x[..., :-1, :-1, :] for x in (lrhs, hrls))
     if a.size == 0:  # one row or column

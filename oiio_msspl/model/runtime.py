@@ -45,16 +45,13 @@ def runtime_version() -> str:
 def load_network(
     path: str | Path, threads: int = 0, providers: Sequence[Provider] = ((CPU, {}),), *, optimise: bool = True
 ) -> Network:
-    """Load a network.
+    """Load an ONNX file, or raise InputError.
 
     Args:
-        path: an ONNX file.
+        path: the file.
         threads: CPU threads; 0 for one a core.
         providers: each operator goes to the first one that supports it.
         optimise: transform the graph for speed. False loads faster, for a network that does not run.
-
-    Raises:
-        InputError: the file cannot be loaded.
     """
     import onnxruntime
 
@@ -95,11 +92,7 @@ def _share_memory() -> None:
 
 
 def release_memory(network: Network, feed: Mapping[str, Array]) -> None:
-    """Run a network on the CPU once more, and give the memory of all networks back to the system.
-
-    Args:
-        feed: inputs (1, channels, height, width), as small as the network takes.
-    """
+    """Run a network on small inputs on the CPU, and give the memory of all networks back to the system."""
     import onnxruntime
 
     options = onnxruntime.RunOptions()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import collections
 import functools
 import logging
 import time
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.image.parallel import check_threads
 from oiio_msspl.model.contract import Contract
@@ -77,12 +76,11 @@ class Session:
         """Time spent in :meth:`run` so far."""
         self._largest = 0
         """LRHS pixels of the largest picture since :meth:`release_memory` was called."""
-        counts = collections.Counter(convolutions(self._session))
-        self.convolutions = dict(counts)
+        self.convolutions = convolutions(self._session)
         """Number of convolutions on each execution provider, see :func:`oiio_msspl.model.runtime.convolutions`."""
-        if device != "cpu" and counts[CPU]:
+        if device != "cpu" and (on_cpu := self.convolutions.get(CPU)):
             message = (
-                f"{file}: {counts[CPU]} of {counts.total()} convolutions stay on the CPU; "
+                f"{file}: {on_cpu} of {sum(self.convolutions.values())} convolutions stay on the CPU; "
                 "use --device cpu, or a --model with a file for GPUs"
             )
             if device in COMPLETE:
@@ -98,7 +96,7 @@ class Session:
     def require_error(self) -> None:
         """Raise InputError if the model does not predict its error."""
         if "log_error" not in self._outputs:
-            raise InputError(f"model {self.contract.name} does not predict its error; choose another --model")
+            raise InputError(f"model {self.name} does not predict its error; choose another --model")
 
     @property
     def clean_aovs(self) -> tuple[str, ...]:
@@ -113,16 +111,12 @@ class Session:
     @functools.cached_property
     def layer_session(self) -> Session | None:
         """The model that fuses passes; None if no network does. It is loaded when it is first needed."""
-        if self.layers is None:
-            return None
-        return Session(self.layers, self.device, self.threads)
+        return Session(self.layers, self.device, self.threads) if self.layers else None
 
     @functools.cached_property
     def half_layer_session(self) -> Session | None:
         """The model that fuses passes at half of the frame's resolution; None if no network does."""
-        if self.half_layers is None:
-            return None
-        return Session(self.half_layers, self.device, self.threads)
+        return Session(self.half_layers, self.device, self.threads) if self.half_layers else None
 
     def release_layer_memory(self) -> None:
         """Call :meth:`release_memory` of the models that fuse passes, if they were loaded."""
@@ -166,16 +160,14 @@ class Session:
             self._largest = pixels
         wanted = ["fused", *(["log_error"] if error else []), *aovs]
         try:
-            results = dict(
-                zip(wanted, self._session.run(wanted, self._feed(lrhs, hrls, exposure, shares)), strict=True)
-            )
+            results = self._session.run(wanted, self._feed(lrhs, hrls, exposure, shares))
         except Exception as cause:
             raise MssplError(
-                f"{self.contract.name} failed on {self.provider} ({str(cause).splitlines()[0]}); "
+                f"{self.name} failed on {self.provider} ({str(cause).splitlines()[0]}); "
                 "try --device cpu, or another --model"
             ) from cause
         self.seconds += time.perf_counter() - start
-        images = {name: values[0].transpose(1, 2, 0) for name, values in results.items()}
+        images = {name: values[0].transpose(1, 2, 0) for name, values in zip(wanted, results, strict=True)}
         if error:
             images["error"] = np.exp(images.pop("log_error"))
         if NORMAL in images:
@@ -204,9 +196,7 @@ class Session:
         self._largest = 0
         if self.provider != CPU:
             return
-        contract = self.contract
-        size = -(-SMALLEST // contract.alignment) * contract.alignment
-        lrhs = {name: np.zeros((size, size, HRLS_FEATURES[name]), np.float32) for name in contract.lrhs}
-        size *= contract.scale
-        hrls = {name: np.zeros((size, size, HRLS_FEATURES[name]), np.float32) for name in contract.hrls}
+        low = -(-SMALLEST // self.contract.alignment) * self.contract.alignment
+        # The other features get their defaults.
+        lrhs, hrls = ({RGB: np.zeros((n, n, 3), np.float32)} for n in (low, low * self.contract.scale))
         release_memory(self._session, self._feed(lrhs, hrls, 1.0, {}))

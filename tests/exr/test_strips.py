@@ -201,8 +201,7 @@ def test_layers_that_do_not_fit_wait_in_a_file(tmp_path, decoded, room, monkeypa
             order = [part.channels[j].name[-1] for j in range(*ranges[i])]
             assert same_bits(np.ascontiguousarray(rows), values[name][..., ["RGB".index(c) for c in order]])
             assert file._cache.bytes <= room * strip_bytes(ROWS_PER_STRIP)
-            waiting = [strip for key, strip in file._cache._strips.items() if key not in file._cache._in_memory]
-            assert all(isinstance(strip.base.base, mmap.mmap) for strip in waiting)
+            assert all(isinstance(strip.base.base, mmap.mmap) for strip in file._cache._spilled.values())
     assert len(decoded) == len(set(decoded)) == 5
 
 

@@ -12,7 +12,6 @@ from oiio_msspl.image.colour import ACES2065, ACESCG, REC709, conversion
 
 #: Another reading of the colours counts if it leaves at most this fraction of the difference of chromaticity.
 BETTER = 0.85
-
 #: It must be better by this many standard errors.
 CERTAIN = 4.0
 #: Colours are not compared if there are fewer blocks.

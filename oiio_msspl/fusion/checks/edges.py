@@ -47,10 +47,7 @@ def foreign_aovs(
 
     Args:
         low, high: luminance (h, w) of LRHS and HRLS.
-        albedo: luminance of the albedo, averaged over LRHS pixels, over the central area; None if there is none.
-        normal_edges: length of the difference of the normals to the next pixels, over the same area; None if there are
-            none.
-        normal_noise: the length of that difference if the normals were constant, by their noise.
+        albedo, normal_edges, normal_noise: see :class:`oiio_msspl.fusion.checks.pair.HrlsAverages`.
     """
     low, high = central_area(low), central_area(high)
     if min(low.shape) < SMALLEST:
@@ -92,9 +89,8 @@ def foreign_aovs(
 
 def _are_noise(edges: Array, noise: Array) -> bool:
     """Return whether most edges (h, w) come from noise."""
-    strong = edges > EDGE
     noisy = blurred(np.square(noise), 4) > NOISE * blurred(np.square(edges), 4)
-    return bool(np.count_nonzero(strong & noisy) > NOISE * np.count_nonzero(strong))
+    return bool(np.mean(noisy[edges > EDGE]) > NOISE)
 
 
 def _log_differences(values: Array, floor: float) -> list[Array]:

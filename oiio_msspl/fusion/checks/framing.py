@@ -63,7 +63,9 @@ def find_framing(low: Array, high: Array) -> Framing:
         return Framing()  # radiance near the limit of float32
     starts = [np.zeros(3)]
     if min(low.shape) >= SMALLEST_COARSE:
-        coarse = _fit(blurred(downsample_4(low), 2), blurred(downsample_4(high), 2), np.zeros(3)).estimate * 4
+        height, width = (n // 4 * 4 for n in low.shape)
+        low_4, high_4 = (blurred(box_downsample(v[:height, :width], 4), 2) for v in (low, high))
+        coarse = _fit(low_4, high_4, np.zeros(3)).estimate * 4
         # A start less than half a pixel away would lead to the same result.
         if np.abs(coarse).max() >= 0.5:
             starts.append(np.clip(coarse, -12, 12))
@@ -147,8 +149,8 @@ def central_area(values: Array) -> Array:
 
 def central_slices(shape: tuple[int, int]) -> tuple[slice, slice]:
     """Return rows and columns of the middle of a picture, at most `AREA` of each."""
-    height, width = (slice(max(0, n - AREA) // 2, min(n, (n + AREA) // 2)) for n in shape)
-    return height, width
+    rows, columns = (slice(max(0, n - AREA) // 2, min(n, (n + AREA) // 2)) for n in shape)
+    return rows, columns
 
 
 def parts(values: Array) -> list[Array]:
@@ -160,9 +162,3 @@ def parts(values: Array) -> list[Array]:
 def jackknife_error(without_part: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the standard error of an estimate, from n estimates (n, ...) that leave out one of n parts each."""
     return np.sqrt((len(without_part) - 1) * without_part.var(axis=0))
-
-
-def downsample_4(values: Array) -> Array:
-    """Average 4 x 4 pixels. Incomplete blocks at the end are left out."""
-    height, width = (n // 4 for n in values.shape)
-    return box_downsample(values[: height * 4, : width * 4], 4)

@@ -20,7 +20,7 @@ from oiio_msspl.fusion.checks.colours import different_colours
 from oiio_msspl.fusion.checks.edges import foreign_aovs
 from oiio_msspl.fusion.checks.framing import central_slices, find_framing, jackknife_error, parts
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
-from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, in_hrls_pixels, read_lrhs, read_tile
+from oiio_msspl.fusion.tiles.features import TileFeatures, in_hrls_pixels, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.arrays import Array, planes_of, quantile
 from oiio_msspl.image.colour import luminance
@@ -75,14 +75,11 @@ class HrlsAverages:
     Attributes:
         rgb: luminance (h, w) over the grid of the alignment.
         albedo: luminance over the central area of the grid, where edges are compared; None if the HRLS has none.
-        normal_edges: length of the difference of the normals to the next pixels, over the same area; None if there are
-            none.
-        normal_noise: root mean square of that difference if the normals were constant, by their noise; None if there
-            are no normals.
-        blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 8): the LRHS's RGB, the HRLS's RGB, the squared
-            difference of luminance, and that which the noise of the HRLS explains.
-        noisy_pixels, equal_pixels: numbers of LRHS pixels over which the HRLS is noisy, and of those among them that
-            equal an HRLS pixel.
+        normal_edges: length of the difference of the normals to the next pixels, over the same area, or None.
+        normal_noise: root mean square of that difference if the normals were constant, by their noise, or None.
+        blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 10): the LRHS's RGB, the HRLS's RGB, the squared
+            difference of luminance, that which the noise of the HRLS explains, and the numbers of LRHS pixels over
+            which the HRLS is noisy, and of those among them that equal an HRLS pixel.
         is_lost: the HRLS's beauty is NaN in all tiles, so its averages are those of the LRHS.
     """
 
@@ -95,8 +92,7 @@ class HrlsAverages:
         self.albedo: Array | None = None
         self.normal_edges: Array | None = None
         self.normal_noise: Array | None = None
-        self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 8))
-        self.noisy_pixels = self.equal_pixels = 0
+        self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 10))
         self.is_lost = True
 
     def add(self, pair: TileFeatures) -> None:
@@ -125,17 +121,11 @@ class HrlsAverages:
             self.normal_edges[target] = _edge_lengths(box_downsample(pixels, pair.scale))
 
     def _add_beauty(self, low: Array, high: Array, place: Window) -> None:
-        """Fill ``rgb``, and sum ``blocks``.
-
-        Args:
-            low, high: colours of both renders (h, w, 3) and (s*h, s*w, 3).
-            place: of the LRHS's pixels in the grid.
-        """
+        """Fill ``rgb`` and sum ``blocks``, given the colours (h, w, 3) and (s*h, s*w, 3) of a ``place`` in the grid."""
         scale = self.alignment.scale
         phases = list(itertools.product(range(scale), repeat=2))
         averages = self.rgb[place.y0 : place.y1, place.x0 : place.x1]
-        values = np.empty((8, *low.shape[:2]), np.float32)
-        counts: list[tuple[int, int]] = []
+        values = np.empty((10, *low.shape[:2]), np.float32)
 
         def work(rows: slice) -> None:
             colour = np.minimum(low[rows], BRIGHTEST)
@@ -147,14 +137,11 @@ class HrlsAverages:
             # Black pixels are equal in any two renders where light is rare.
             noisy = (grey > 0) & (expected > np.square(np.float32(5 * NOISY) * grey))
             nearest = reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - grey) for i, j in phases))
-            equal = noisy & (nearest <= 1e-3 * grey)
-            counts.append((int(np.count_nonzero(noisy)), int(np.count_nonzero(equal))))
             values[:3, rows], values[3:6, rows] = planes_of(colour), planes_of(mean)
             values[6, rows], values[7, rows] = np.square(averages[rows] - grey), expected
+            values[8, rows], values[9, rows] = noisy, noisy & (nearest <= 1e-3 * grey)
 
         for_row_blocks(work, len(low), high[0].size * scale)
-        self.noisy_pixels += sum(noisy for noisy, _ in counts)
-        self.equal_pixels += sum(equal for _, equal in counts)
         sums: NDArray[Any] = values
         for axis, (start, stop) in ((1, (place.y0, place.y1)), (2, (place.x0, place.x1))):
             first = np.maximum(np.arange(start // BLOCK * BLOCK, stop, BLOCK) - start, 0)
@@ -174,25 +161,17 @@ def _edge_lengths(normal: Array) -> Array:
 
 def _noise_of_edges(pixels: Array, scale: int) -> Array:
     """Return :func:`_edge_lengths` of constant normals with the noise of the HRLS's (s*h, s*w, 3), RMS, (h, w)."""
-    result = np.empty([side // scale for side in pixels.shape[:2]], np.float32)
-
-    def work(rows: slice) -> None:
-        block = pixels[rows.start * scale : rows.stop * scale]
-        variance = reduce(np.add, planes_of(_noise_variance(block)))
-        # Means over scale x scale pixels, in two differences of two of them each.
-        result[rows] = np.sqrt(box_downsample(variance, scale // 2)) * np.float32(2 / scale)
-
-    for_row_blocks(work, len(result), pixels[0].size * scale)
-    return result
+    variance = reduce(np.add, planes_of(_noise_variance(pixels)))
+    # Means over scale x scale pixels, in two differences of two of them each.
+    noise: Array = np.sqrt(box_downsample(variance, scale // 2)) * np.float32(2 / scale)
+    return noise
 
 
 def _noise_variance(pixels: Array) -> Array:
-    """Estimate the variance of noise (h / 2, w / 2, ...) from 2 x 2 pixels each.
-
-    Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
-    """
-    quads = [pixels[i::2, j::2] for i in (0, 1) for j in (0, 1)]
-    variance: Array = np.square(quads[0] - quads[1] - quads[2] + quads[3]) / np.float32(4)
+    """Estimate the variance of noise (h / 2, w / 2, ...) from 2 x 2 pixels each."""
+    # Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
+    a, b, c, d = (pixels[i::2, j::2] for i in (0, 1) for j in (0, 1))
+    variance: Array = np.square(a - b - c + d) / np.float32(4)
     return variance
 
 
@@ -202,25 +181,17 @@ def _hrls_pixels(pair: TileFeatures, feature: str, window: Window) -> Array:
 
 
 def check_renders(lr: ReadableRender, hr: ReadableRender) -> list[str]:
-    """Check whether two renders show the same frame, without fusing them.
-
-    Args:
-        lr, hr: files with their layers mapped, or renders in memory.
-
-    Returns:
-        Warnings of :func:`check_pair`.
+    """Check whether two renders show the same frame, without fusing them. Return warnings of :func:`check_pair`.
 
     Raises:
         InputError: the pair does not fit together, or can't be read.
     """
     alignment = align(lr, hr)
-    grid, counts = alignment.grid, RepairCounts()
-    lrhs = read_lrhs(lr, alignment, grid, [RGB], counts)
+    grid = alignment.grid
+    lrhs = read_lrhs(lr, alignment, grid, [RGB])
     averages = HrlsAverages(alignment)
-    rows = max(1, PIXELS_PER_READ // (grid.width * alignment.scale**2))
-    for top in range(grid.y0, grid.y1, rows):
-        band = Window(grid.x0, top, grid.x1, min(top + rows, grid.y1))
-        averages.add(read_tile(Tile(band, band), lrhs, grid, hr, alignment, [RGB, ALBEDO, NORMAL], counts))
+    for band in grid.bands(max(1, PIXELS_PER_READ // (grid.width * alignment.scale**2))):
+        averages.add(read_tile(Tile(band, band), lrhs, grid, hr, alignment, [RGB, ALBEDO, NORMAL]))
     return check_pair(bounded_luminance(lrhs[RGB]), averages, lr.name, hr.name)
 
 
@@ -230,15 +201,11 @@ def bounded_luminance(rgb: Array) -> Array:
 
 
 def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> list[str]:
-    """Check whether two renders show the same frame.
+    """Check whether two renders show the same frame. Return warnings, one sentence each.
 
     Args:
         low: luminance of the LRHS (h, w) over the grid of the alignment, see :func:`bounded_luminance`.
         hrls: averages of all tiles.
-        lr_name, hr_name: names of the renders in messages.
-
-    Returns:
-        Warnings, one sentence each.
 
     Raises:
         InputError: one render is black, most likely a wrong layer, and the other one is lit by more than chance.
@@ -253,13 +220,11 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
             if np.count_nonzero(lit) > min(MOST_BY_CHANCE, lit.size // 2):
                 raise _black_beauty(black_name, lit_name)
             return []  # a dark frame in which few samples find the light
-    warnings = []
-    for black_name, black, lit_name, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
-        if _is_region(black, lit):
-            warnings.append(
-                f"the {black_name} is black outside of a rectangle, where the {lit_name} is lit: was a render region "
-                "on?"
-            )
+    warnings = [
+        f"the {black_name} is black outside of a rectangle, where the {lit_name} is lit: was a render region on?"
+        for black_name, black, lit_name, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high))
+        if _is_region(black, lit)
+    ]
     framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
     if _has_same_noise(hrls):
@@ -330,7 +295,8 @@ def _has_same_noise(hrls: HrlsAverages) -> bool:
     if int(np.count_nonzero(noisy)) < max(MIN_NOISY_BLOCKS, int(np.count_nonzero(brightness)) // 4):
         return False
     scaled_down = float(np.quantile(difference[noisy] / expected[noisy], 0.75)) < SAME_NOISE
-    return scaled_down or hrls.equal_pixels > EQUAL_PIXELS * max(hrls.noisy_pixels, 1)
+    noisy_pixels, equal_pixels = hrls.blocks[..., 8:].sum(axis=(0, 1))
+    return scaled_down or bool(equal_pixels > EQUAL_PIXELS * max(noisy_pixels, 1))
 
 
 def _log_correlation(hrls: HrlsAverages) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, read_features, read_lrhs
+from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features, read_lrhs
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import box_downsample
@@ -44,7 +44,7 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
     scale, correlations = alignment.scale, []
     with hr.cache_strips(CACHE_BYTES):
         for window in _samples(alignment.grid):
-            low = read_lrhs(lr, alignment, window, [RGB], RepairCounts())[RGB]
+            low = read_lrhs(lr, alignment, window, [RGB])[RGB]
             area = in_hrls_pixels(window, scale)
             high = read_features(hr, area, alignment.hr_data_window, [RGB])[RGB]
             exposure = find_exposure(low)
@@ -62,14 +62,12 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
 def _samples(grid: Window) -> list[Window]:
     """Return different squares of at most ``SAMPLE`` pixels, evenly spread over the grid."""
 
-    def starts(first: int, side: int) -> list[int]:
-        size = min(SAMPLE, side)
-        return sorted({first + round(i * (side - size) / (SAMPLES - 1)) for i in range(SAMPLES)})
-
     width, height = min(SAMPLE, grid.width), min(SAMPLE, grid.height)
-    return [
-        Window(x, y, x + width, y + height) for y in starts(grid.y0, grid.height) for x in starts(grid.x0, grid.width)
-    ]
+    columns, rows = (
+        sorted({first + round(i * rest / (SAMPLES - 1)) for i in range(SAMPLES)})
+        for first, rest in ((grid.x0, grid.width - width), (grid.y0, grid.height - height))
+    )
+    return [Window(x, y, x + width, y + height) for y in rows for x in columns]
 
 
 def _correlations(image: Array) -> NDArray[np.float64]:
@@ -78,14 +76,10 @@ def _correlations(image: Array) -> NDArray[np.float64]:
     blocks = image[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2)
     residual = (blocks.reshape(-1, BLOCK**2).astype(np.float64) @ _without_course()).reshape(-1, BLOCK, BLOCK)
     residual = residual[residual.var(axis=(1, 2)) > 1e-8]  # black and blown-out blocks have no noise
-    return _neighbours(residual) - _neighbours_of_white_noise()
-
-
-def _neighbours(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
-    across = (blocks[:, :, 1:] * blocks[:, :, :-1]).mean(axis=(1, 2))
-    down = (blocks[:, 1:] * blocks[:, :-1]).mean(axis=(1, 2))
-    result: NDArray[np.float64] = (across + down) / 2 / np.square(blocks).mean(axis=(1, 2))
-    return result
+    across = (residual[:, :, 1:] * residual[:, :, :-1]).mean(axis=(1, 2))
+    down = (residual[:, 1:] * residual[:, :-1]).mean(axis=(1, 2))
+    result: NDArray[np.float64] = (across + down) / 2 / np.square(residual).mean(axis=(1, 2))
+    return result - _neighbours_of_white_noise()
 
 
 @functools.cache

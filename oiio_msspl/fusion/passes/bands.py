@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.additive_sets import AdditiveLayer
+from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.passes.layers import Factor, is_black
 from oiio_msspl.fusion.passes.lines import STEPS, BeautyFit, downsampled, smoothed
 from oiio_msspl.fusion.passes.plan import PassJob
@@ -37,17 +38,34 @@ FIREFLY = 4.0
 
 
 @dataclass(frozen=True)
-class PassSources:
-    """What the layers of a frame are fused from."""
+class PassInputs:
+    """A fused pair, and the sets of layers that are to be fused."""
+
+    lr: MappedRender
+    """The LRHS. Layers that it lacks are fused from the HRLS alone."""
+    hr: MappedRender
+    """The HRLS."""
+    rgb: Array
+    """The fused beauty, (height, width, 3), over the HRLS's data window."""
+    alignment: Alignment
+    """Of the pair."""
+    sets: Sequence[AdditiveSet]
+    """Of the HRLS's ``additive_sets``. Those that do not sum to its beauty are refused."""
+    guides: Guides = field(default_factory=dict)
+    """Albedo and normal without noise, (height, width, 3) as the HRLS's; those that there are. Albedos above 1 are
+    taken from the HRLS."""
+    averaged: tuple[Render, Render] | None = None
+    """LRHS and HRLS with the features of :func:`oiio_msspl.fusion.passes.layers.pass_features`, averaged with those of
+    other frames; None to read the files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PassSources(PassInputs):
+    """A fused pair whose layers can be read."""
 
     low: ReadableRender
     high: ReadableRender
     """LRHS and HRLS, with the features of :class:`oiio_msspl.fusion.passes.layers.LayerLight`."""
-    rgb: Array
-    """The fused beauty, (height, width, 3), over the HRLS's data window."""
-    alignment: Alignment
-    guides: Guides
-    """Albedo and normal without noise, (height, width, 3) as the HRLS's; those that there are."""
     colours: Mapping[Factor, str]
     """Names, as features of the HRLS, of the colours by which layers are multiplied."""
 
@@ -57,12 +75,12 @@ class PassSources:
         lit = self.rgb[::4, ::4][self.rgb[::4, ::4] > 0]
         return DARK * float(np.median(lit)) if lit.size else 1.0
 
-    def beauty(self, area: Window) -> Array:
-        """Return the fused beauty (3, h, w) over HRLS pixels, mirrored beyond the data window.
+    def planes(self, image: NDArray[Any], area: Window) -> Array:
+        """Return an image (height, width, 3) over the HRLS's data window as planes over ``area``, mirrored beyond.
 
         A frame that is stored as half is fused as half. Variances would be lost in its rounding, so this is float32.
         """
-        return planes_of(mirrored(self.rgb, self.alignment.hr_data_window, area)).astype(np.float32)
+        return planes_of(mirrored(image, self.alignment.hr_data_window, area)).astype(np.float32, copy=False)
 
     def unload(self) -> None:
         """Give the memory of guides that wait in temporary files back to the system."""
@@ -72,17 +90,14 @@ class PassSources:
 
 def band_windows(alignment: Alignment) -> list[Window]:
     """Return the bands of LRHS rows that are fused one after the other."""
-    grid, rows = alignment.grid, BAND_ROWS // alignment.scale
-    return [Window(grid.x0, top, grid.x1, min(top + rows, grid.y1)) for top in range(grid.y0, grid.y1, rows)]
+    return list(alignment.grid.bands(BAND_ROWS // alignment.scale))
 
 
 class Band:
     """Some rows of a frame: the fused beauty, and the layers of both renders at the LRHS's resolution.
 
     Args:
-        sources: of the frame.
         core: the LRHS pixels that are fused.
-        jobs: the sets.
         full_size: layers that a network has fused at full resolution.
     """
 
@@ -90,7 +105,7 @@ class Band:
         self, sources: PassSources, core: Window, jobs: Sequence[PassJob], full_size: Collection[AdditiveLayer]
     ) -> None:
         alignment = sources.alignment
-        self.sources, self._full_size, self.scale = sources, full_size, alignment.scale
+        self.sources, self.scale = sources, alignment.scale
         reach = 2 * sum(STEPS[self.scale]) + 2
         self.area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach).intersect(alignment.grid)
         """The core and the pixels around that are read, in LRHS pixels."""
@@ -98,15 +113,16 @@ class Band:
         """The core's rows in the area."""
         self.hrls_core, self._hrls_area = (in_hrls_pixels(window, self.scale) for window in (core, self.area))
         self._hrls_rows = self.hrls_core.slices(self._hrls_area)[0]
-        self._beauty = sources.beauty(self._hrls_area)
+        self._beauty = sources.planes(sources.rgb, self._hrls_area)
         self.low_beauty = downsampled(self._beauty, self.scale)
         """The fused beauty (3, h, w) over the area, at the LRHS's resolution."""
-        self._to_fit = [job for job in jobs if job.remainder or self._has_light_to_fit(job)]
+        self.to_fit = [job for job in jobs if job.remainder or self._has_light(job, full_size)]
+        """The sets that have light here that no network has fused at full resolution."""
         factors = {layer.factor for job in jobs for layer in job.estimated}
         colours = {factor: name for factor, name in sources.colours.items() if factor in factors}
         names = {name: layer for job in jobs for layer, name in job.names.items()}
         # A file decodes all layers together, so all are read at once.
-        needed = [*colours.values(), RGB, *names, *([ALBEDO, NORMAL] if self._to_fit else [])]
+        needed = [*colours.values(), RGB, *names, *([ALBEDO, NORMAL] if self.to_fit else [])]
         window, counts = alignment.hr_data_window, RepairCounts()
         features = read_features(sources.high, self._hrls_area, window, needed, counts=counts, counted=self.hrls_core)
         self.repaired = {names[name].name: count for name, count in counts.repaired.items() if name in names}
@@ -116,28 +132,24 @@ class Band:
         }
         """What products of light and colour are divided by, (3, h, w) over the core."""
         images = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
+        # LRHS pixels at the edge of a window or of a lamp show a part of it, and its light would leak over the edge.
         self.ranges = {
-            layer: self._range_around(features[job.names[layer]])
+            layer: tuple(planes_of(sign * max_3x3(sign * samples)[self._hrls_rows]) for sign in (-1, 1))
             for job in jobs
             for layer in job.noise_free.intersection(job.estimated)
+            for samples in (features[job.names[layer]],)
         }
         """For each layer without noise, the lowest and highest values around each pixel of the core, (3, h, w)."""
         self._low_layers = {name: box_downsample(values, self.scale) for name, values in features.items()}
         lrhs = [name for job in jobs for name in job.lrhs]
-        self._lrhs_layers = {}
-        if lrhs:
-            self._lrhs_layers = read_lrhs(sources.low, alignment, self.area, [RGB, *lrhs], RepairCounts())
+        self._lrhs_layers = read_lrhs(sources.low, alignment, self.area, [RGB, *lrhs]) if lrhs else {}
         self._fits: dict[Sequence[int], BeautyFit] = {}
-        self._guides = self._compared(images) if self._to_fit else None
+        self._guides = self._compared(images) if self.to_fit else None
 
     @property
     def beauty(self) -> Array:
         """The fused beauty (3, h, w) over the core."""
         return self._beauty[:, self._hrls_rows]
-
-    def needs_fit(self, job: PassJob) -> bool:
-        """Return whether a set has light here that no network has fused at full resolution."""
-        return job in self._to_fit
 
     def fit_at(self, steps: tuple[int, ...]) -> BeautyFit:
         """Return the beauty that layers are fitted to, see :data:`oiio_msspl.fusion.passes.lines.STEPS`."""
@@ -146,28 +158,20 @@ class Band:
             self._fits[steps] = BeautyFit(self._beauty, self._guides, self.scale, steps, self.rows)
         return self._fits[steps]
 
-    def over_core(self, image: NDArray[Any]) -> Array:
-        """Return an image (height, width, 3) over the HRLS's data window as planes over the core, mirrored beyond."""
-        return planes_of(mirrored(image, self.sources.alignment.hr_data_window, self.hrls_core))
-
     def renders_of(self, job: PassJob) -> list[Array]:
         """Return the layers of the HRLS, and of the LRHS if it has some, see :func:`dimmed`."""
         renders = [self._low_layers, self._lrhs_layers] if job.lrhs else [self._low_layers]
         return [dimmed(job, pixels, self.low_beauty) for pixels in renders]
 
-    def _has_light_to_fit(self, job: PassJob) -> bool:
-        area, low, high = self.area, self.sources.low, self.sources.high
+    def _has_light(self, job: PassJob, full_size: Collection[AdditiveLayer]) -> bool:
+        """Return whether an estimated layer, except those at full resolution, has light in the area."""
         # An LRHS of an odd size is up to a pixel away.
-        low_area = Window(area.x0, area.y0 - 1, area.x1, area.y1 + 1)
-        names = [job.names[layer] for layer in job.estimated if layer not in self._full_size]
-        if any(not is_black(high, name, self._hrls_area) for name in names):
-            return True
-        return any(not is_black(low, name, low_area) for name in names if name in job.lrhs)
-
-    def _range_around(self, samples: Array) -> tuple[Array, Array]:
-        # LRHS pixels at the edge of a window or of a lamp show a part of it, and its light would leak over the edge.
-        lowest, highest = -max_3x3(-samples), max_3x3(samples)
-        return planes_of(lowest[self._hrls_rows]), planes_of(highest[self._hrls_rows])
+        low_area = Window(self.area.x0, self.area.y0 - 1, self.area.x1, self.area.y1 + 1)
+        return any(
+            not is_black(self.sources.high, name, self._hrls_area)
+            or (name in job.lrhs and not is_black(self.sources.low, name, low_area))
+            for name in (job.names[layer] for layer in job.estimated if layer not in full_size)
+        )
 
     def _compared(self, images: Guides) -> Array:
         """Return planes by which pixels are compared, given albedo and normal (h, w, 3) of the HRLS."""
@@ -177,8 +181,7 @@ class Band:
             noisy = planes_of(image)
             guide = smoothed(noisy, log)
             if name in self.sources.guides:
-                window = self.sources.alignment.hr_data_window
-                clean = planes_of(mirrored(self.sources.guides[name], window, self._hrls_area))
+                clean = self.sources.planes(self.sources.guides[name], self._hrls_area)
                 # Some renderers write the colour of an emitter as its albedo, and tell lamps apart by that.
                 guide = np.where((noisy > 1).any(axis=0), guide, clean)
             planes.append(guide / SPREAD[name])
@@ -191,7 +194,6 @@ def dimmed(job: PassJob, pixels: Mapping[str, Array], beauty: Array) -> Array:
     Layers that it lacks are black. The rest of its beauty is the last layer, if layers are missing or light is in none.
 
     Args:
-        job: the set.
         pixels: features (h, w, 3) of the render.
         beauty: the fused one (3, h, w).
     """

@@ -16,7 +16,7 @@ from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.fusion.passes.bands import Band, PassSources, dimmed, estimated_of, in_both
 from oiio_msspl.fusion.passes.lines import downsampled
 from oiio_msspl.fusion.passes.plan import PassJob
-from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, read_features, read_lrhs
+from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features, read_lrhs
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.filters import blurred, box_downsample, filled, max_3x3, upsample_linear
 from oiio_msspl.image.parallel import for_row_blocks
@@ -46,8 +46,6 @@ def make_exact(
     Args:
         layers: (layers, 3, h, w) over the core of the band.
         light: (3, h, w).
-        job: the set.
-        band: the rows.
         shares: of the layers, where none has a sample near.
         doubts: see :func:`doubts_of`; None if the LRHS has no layer.
     """
@@ -61,36 +59,26 @@ def make_exact(
     dark = (layers.sum(axis=0) == 0) & (light > 0)
     if dark.any():
         layers[:, dark] = shares.at(job, band, dark)
-    colours = {layer: band.colours[layer.factor] for layer in job.estimated if layer.factor is not None}
-    if colours:
-        for planes, layer in zip(layers, job.estimated, strict=False):
-            if layer in colours:
-                planes *= colours[layer] >= DARKEST_COLOUR
-        _give_lost_light(layers, light, job, band, shares)
-    spread_rest(layers, light, doubts)
-
-
-def _give_lost_light(layers: Array, light: Array, job: PassJob, band: Band, shares: SharesAround) -> None:
-    """Give light that no layer can store, because all their colours are black, to the layers without colour."""
-    lost = (layers.sum(axis=0) == 0) & (light > 0)
     free = [i for i, layer in enumerate(job.estimated) if layer.factor is None]
-    if free and lost.any():
-        around = shares.at(job, band, lost)[free]
-        around[:, around.sum(axis=0) == 0] = 1
-        for i, share in zip(free, around, strict=True):
-            layers[i][lost] = share
+    if len(free) < len(job.estimated):
+        for planes, layer in zip(layers, job.estimated, strict=False):
+            if layer.factor is not None:
+                planes *= band.colours[layer.factor] >= DARKEST_COLOUR
+        # Light that no layer can store, because all their colours are black, goes to the layers without colour.
+        lost = (layers.sum(axis=0) == 0) & (light > 0)
+        if free and lost.any():
+            around = shares.at(job, band, lost)[free]
+            around[:, around.sum(axis=0) == 0] = 1
+            for i, share in zip(free, around, strict=True):
+                layers[i][lost] = share
+    spread_rest(layers, light, doubts)
 
 
 def doubts_of(job: PassJob, band: Band, hrls: Array, lrhs: Array) -> Array:
     """Return how uncertain each layer is, (layers, h, w) over the core, at most 1.
 
     It is the root of the mean difference between the two renders, relative to the layer where that is largest. A layer
-    that the LRHS lacks is most uncertain.
-
-    Args:
-        job: the set.
-        band: the rows.
-        hrls, lrhs: of :meth:`Band.renders_of`.
+    that the LRHS lacks is most uncertain. ``hrls``, ``lrhs``: of :meth:`Band.renders_of`.
     """
     shared = in_both(job, len(hrls))
     differences = np.abs(hrls - lrhs[: len(hrls)]).mean(axis=1)
@@ -108,11 +96,9 @@ def spread_rest(layers: Array, beauty: Array, doubts: Array | None) -> None:
     Where all are black, they stay black.
 
     Args:
-        layers, beauty: see above.
         doubts: how uncertain each layer is (n, h, w), from 0 to 1. What is lacking is spread in proportion to light
             times doubt, and the rest of it to light times squared doubt; in proportion to light if this is None.
     """
-
     tiny = np.finfo(np.float32).tiny
 
     def work(rows: slice) -> None:
@@ -124,14 +110,12 @@ def spread_rest(layers: Array, beauty: Array, doubts: Array | None) -> None:
             lacking = np.clip(wanted - total, -most, most)
             weights = part * np.maximum(doubt, LEAST_DOUBT)
             lacking /= np.maximum(weights.sum(axis=0), tiny)
-            weights *= lacking
-            part += np.maximum(weights, -MOST_SPREAD * part)
+            part += np.maximum(weights * lacking, -MOST_SPREAD * part)
             total = part.sum(axis=0)
             if is_far:
                 weights = part * np.maximum(np.square(doubt), LEAST_SQUARED_DOUBT)
                 weights /= np.maximum(weights.sum(axis=0), tiny)
-                weights *= np.maximum(wanted - total, 0)
-                part += weights
+                part += weights * np.maximum(wanted - total, 0)
                 total = part.sum(axis=0)
         # The beauty divided by a tiny total would overflow; a layer's part of the total never does.
         part /= np.where(total > 0, total, 1)
@@ -165,29 +149,25 @@ class SharesAround:
         return sample_linear(self._shares[job.layers.name], columns, rows).T
 
     def _measure(self, job: PassJob) -> Array:
-        """Return the shares in each square of the frame, (rows, columns, layers).
-
-        A square without light gets those of the squares around, and all get equal ones if none has light.
-        """
+        """Return the shares in each square of the frame, (rows, columns, layers); of those around where it is black."""
         grid, side = self._sources.alignment.grid, SQUARE // self._sources.alignment.scale
-        tops = range(grid.y0, grid.y1, side)
-        light = np.stack([self._light_of(job, Window(grid.x0, top, grid.x1, min(top + side, grid.y1))) for top in tops])
+        light = np.stack([self._light_of(job, rows) for rows in grid.bands(side)])
         total = light.sum(axis=-1, keepdims=True)
         lit = total[..., 0] > 0
         if not lit.any():
-            return np.full(light.shape, 1, np.float32)
+            return np.ones(light.shape, np.float32)
         return filled(np.divide(light, np.where(total > 0, total, 1), dtype=np.float32), ~lit)
 
     def _light_of(self, job: PassJob, area: Window) -> NDArray[np.float64]:
-        """Return the light of the layers in each square of a row of squares, (columns, layers)."""
+        """Return the light of the layers in each of a row of squares, (columns, layers)."""
         sources, alignment = self._sources, self._sources.alignment
         hrls_area = in_hrls_pixels(area, alignment.scale)
-        beauty = downsampled(sources.beauty(hrls_area), alignment.scale)
+        beauty = downsampled(sources.planes(sources.rgb, hrls_area), alignment.scale)
         features = read_features(sources.high, hrls_area, alignment.hr_data_window, [RGB, *job.names.values()])
         low = {name: box_downsample(image, alignment.scale) for name, image in features.items()}
         layers = dimmed(job, low, beauty)
         if job.lrhs:
-            lrhs = read_lrhs(sources.low, alignment, area, [RGB, *job.lrhs], RepairCounts())
+            lrhs = read_lrhs(sources.low, alignment, area, [RGB, *job.lrhs])
             shared = in_both(job, len(layers))
             layers[shared] = (layers[shared] + dimmed(job, lrhs, beauty)[: len(layers)][shared]) / 2
         for render in (sources.low, sources.high):

@@ -20,26 +20,20 @@ def fit_to_beauty(band: Band, job: PassJob, renders: Sequence[Array], out: Array
     """Fit layers of a set to the fused beauty.
 
     Args:
-        band: the rows.
-        job: the set.
         renders: of :meth:`Band.renders_of`. The first one may be written over.
         out: gets the layers, (layers, 3, h, w) over the core.
         missing: which ones to fit. Black ones stay as they are.
     """
-    noisy = _means(band, job, *renders)
+    noisy, *lrhs = renders
+    for layers in lrhs:
+        weight = _likeness(band, layers)
+        for i in np.flatnonzero(in_both(job, len(noisy))):
+            noisy[i] += weight * layers[i]
+            noisy[i] /= 1 + weight
+    noisy = estimated_of(job, noisy)
     if lit := [i for i in missing if noisy[i].any()]:
         fit = band.fit_at(STEPS[band.scale])
         fit.fit_layers([noisy[i] for i in lit], [out[i] for i in lit], few_samples=True)
-
-
-def _means(band: Band, job: PassJob, hrls: Array, lrhs: Array | None = None) -> Array:
-    """Return the means of both renders' layers (layers, 3, h, w), of those that are estimated."""
-    if lrhs is not None:
-        weight = _likeness(band, lrhs)
-        for i in np.flatnonzero(in_both(job, len(hrls))):
-            hrls[i] += weight * lrhs[i]
-            hrls[i] /= 1 + weight
-    return estimated_of(job, hrls)
 
 
 def _likeness(band: Band, layers: Array) -> Array:

@@ -16,13 +16,12 @@ from functools import partial, reduce
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
-from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.exr.render import ReadableRender, Render, Window
+from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.passes.bands import Band, Guides, PassSources, band_windows
+from oiio_msspl.fusion.passes.bands import Band, PassInputs, PassSources, band_windows
 from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, doubts_of, make_exact
 from oiio_msspl.fusion.passes.fit import fit_to_beauty
-from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, load_pixels, lrhs_names
+from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, lrhs_names
 from oiio_msspl.fusion.passes.network import LayerFuser, LayersByNetwork
 from oiio_msspl.fusion.passes.plan import PassJob, PassPlan, plan_passes
 from oiio_msspl.fusion.tiles.alignment import Alignment
@@ -31,28 +30,6 @@ from oiio_msspl.image.parallel import half_of_the_threads, in_parallel, one_ahea
 
 #: What derived layers leave of the beauty counts as rounding below this share of it.
 ROUNDING = np.float32(5e-7)
-
-
-@dataclass(frozen=True)
-class PassInputs:
-    """A fused pair, and the sets of layers that are to be fused."""
-
-    lr: MappedRender
-    """The LRHS. Layers that it lacks are fused from the HRLS alone."""
-    hr: MappedRender
-    """The HRLS."""
-    rgb: Array
-    """The fused beauty, (height, width, 3), over the HRLS's data window."""
-    alignment: Alignment
-    """Of the pair."""
-    sets: Sequence[AdditiveSet]
-    """Of the HRLS's ``additive_sets``. Those that do not sum to its beauty are refused."""
-    guides: Guides = field(default_factory=dict)
-    """Albedo and normal without noise, (height, width, 3) as the HRLS's; those that there are. Albedos above 1 are
-    taken from the HRLS."""
-    averaged: tuple[Render, Render] | None = None
-    """LRHS and HRLS with the features of :func:`oiio_msspl.fusion.passes.layers.pass_features`, averaged with those of
-    other frames; None to read the files."""
 
 
 @dataclass
@@ -101,7 +78,15 @@ def fuse_passes(
     network = LayersByNetwork(sources, jobs, fuse_layers)
     bands = len(band_windows(inputs.alignment))
     steps = pass_steps(inputs.alignment, inputs.sets, by_network=fuse_layers is not None)
-    tell = _counter(progress, steps - bands * sum(1 + network.count(job) for job in jobs), steps)
+    done = steps - bands * sum(1 + network.count(job) for job in jobs)
+
+    def tell(count: int) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(done, steps)
+
+    tell(0)
     for _ in itertools.chain.from_iterable(map(network.fuse, jobs)):
         tell(bands)
     later = {part for job in jobs for parts in job.derived.values() for part in parts}
@@ -133,25 +118,9 @@ def fuse_passes(
 
 
 def pass_steps(alignment: Alignment, sets: Sequence[AdditiveSet], *, by_network: bool) -> int:
-    """Return the steps in which sets are fused, for progress: each set in each band of rows.
-
-    A layer that a network fuses counts as much as a set.
-    """
+    """Return the steps for progress: each set in each band of rows. A layer for a network counts as much as a set."""
     layers = sum(len(additive_set.layers) for additive_set in sets) if by_network else 0
     return len(band_windows(alignment)) * (len(sets) + layers)
-
-
-def _counter(progress: Callable[[int, int], None] | None, done: int, steps: int) -> Callable[[int], None]:
-    """Return a function that adds to the steps that are done, and tells their number."""
-
-    def tell(count: int) -> None:
-        nonlocal done
-        done += count
-        if progress is not None:
-            progress(done, steps)
-
-    tell(0)
-    return tell
 
 
 def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, LayerLight]:
@@ -168,9 +137,9 @@ def _sources_of(inputs: PassInputs, low: LayerLight, high: LayerLight) -> PassSo
     renders: tuple[ReadableRender, ReadableRender] = (low.pixels, high.pixels)
     if inputs.averaged is not None:
         # Light is divided by the colours of this frame, because those are written.
-        colours = load_pixels(high.file, high.colours.values()).layers
+        colours = high.file.load(high.colours.values(), on_disk=is_large(high.file)).layers
         renders = inputs.averaged[0], replace(inputs.averaged[1], layers=inputs.averaged[1].layers | colours)
-    return PassSources(*renders, inputs.rgb, inputs.alignment, inputs.guides, high.colours)
+    return PassSources(**vars(inputs), low=renders[0], high=renders[1], colours=high.colours)
 
 
 def _blank_result(plan: PassPlan, inputs: PassInputs, pixels: ReplacedChannels) -> FusedPasses:
@@ -194,7 +163,7 @@ def _read_bands(sources: PassSources, jobs: Sequence[PassJob], network: LayersBy
         with half_of_the_threads():
             return Band(sources, core, jobs, network.at_full_size)
 
-    for band in one_ahead(map(prepare, band_windows(sources.alignment))) if jobs else ():
+    for band in one_ahead(map(prepare, band_windows(sources.alignment) if jobs else ())):
         yield band
         sources.unload()
         network.unload()
@@ -214,7 +183,7 @@ def _fuse_set(
         doubts = doubts_of(job, band, *renders) if job.lrhs else None
         layers = np.zeros((len(job.estimated) + job.remainder, *rest.shape), np.float32)
         fused = network.estimate(band, job, layers)
-        if band.needs_fit(job):
+        if job in band.to_fit:
             fit_to_beauty(band, job, renders, layers, [i for i in range(len(layers)) if i not in fused])
         make_exact(layers, rest, job, band, shares, doubts)
         lights |= dict(zip(job.estimated, layers, strict=False))

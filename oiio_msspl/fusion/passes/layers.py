@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,26 +30,20 @@ class LayerLight:
     """Has these features, the beauty, albedo, normal and :attr:`colours`."""
     names: Mapping[AdditiveLayer, str]
     """Names of features, by layer."""
-    decoded: Render | None = None
-    """All of them; None if each read decodes what it needs."""
-
-    @property
-    def pixels(self) -> ReadableRender:
-        """Where the features are read."""
-        return self.decoded or self.file
+    pixels: ReadableRender
+    """Where the features are read: all are decoded, or each read decodes what it needs."""
 
     @property
     def colours(self) -> dict[Factor, str]:
         """Names, as features, of the colours by which layers are multiplied."""
-        return _colour_names(self.names)
+        factors = dict.fromkeys(layer.factor for layer in self.names if layer.factor is not None)
+        return {factor: f"colour {i}" for i, factor in enumerate(factors)}
 
 
 def light_of(render: MappedRender, names: Mapping[AdditiveLayer, str], *, decode: bool = False) -> LayerLight:
     """Return the light of layers of a render.
 
     Args:
-        render: the file.
-        names: see :attr:`LayerLight.names`.
         decode: whether all pixels are decoded now, once: into temporary files if there are many.
 
     Raises:
@@ -57,24 +51,14 @@ def light_of(render: MappedRender, names: Mapping[AdditiveLayer, str], *, decode
     """
     formulas = {name: render.features[name] for name in (RGB, ALBEDO, NORMAL) if name in render.features}
     formulas |= {name: layer.formula for layer, name in names.items()}
-    formulas |= {name: FeatureFormula((factor,)) for factor, name in _colour_names(names).items()}
+    formulas |= {name: FeatureFormula((factor,)) for factor, name in LayerLight(render, names, render).colours.items()}
     file = replace(render, features=formulas)
-    return LayerLight(file, names, load_pixels(file, formulas) if decode else None)
-
-
-def load_pixels(render: MappedRender, features: Iterable[str]) -> Render:
-    """Decode features of a render: into temporary files if there are many pixels."""
-    return render.load(features, on_disk=is_large(render))
+    return LayerLight(file, names, file.load(formulas, on_disk=is_large(file)) if decode else file)
 
 
 def is_large(render: MappedRender) -> bool:
     """Return whether a render has many pixels."""
     return has_many_pixels(render.data_window.height, render.data_window.width)
-
-
-def _colour_names(layers: Iterable[AdditiveLayer]) -> dict[Factor, str]:
-    factors = dict.fromkeys(layer.factor for layer in layers if layer.factor is not None)
-    return {factor: f"colour {i}" for i, factor in enumerate(factors)}
 
 
 def layer_names(sets: Sequence[AdditiveSet]) -> dict[AdditiveLayer, str]:
@@ -115,27 +99,17 @@ def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet
 
     The LRHS may lack some of them.
     """
-    members = {layer for additive_set in sets for layer in additive_set.layers}
-    high = {name: layer.formula for layer, name in layer_names(sets).items() if layer in members}
+    names = layer_names(sets)
+    high = {names[layer]: layer.formula for additive_set in sets for layer in additive_set.layers}
     low = {name: layer.formula for layer, name in lrhs_names(lr, sets).items()}
     return replace(lr, features=lr.features | low), replace(hr, features=hr.features | high)
 
 
 def is_black(render: ReadableRender, name: str, area: Window | None = None) -> bool:
-    """Return whether a feature of a render has no light in an area, or anywhere.
-
-    One in a file may have some, because it would have to be decoded.
-
-    Args:
-        render: the render.
-        name: of the feature.
-        area: relative to the top left of the display window.
-    """
+    """Return whether a feature of a decoded render has no light in an area of the display window, or anywhere."""
     if not isinstance(render, Render):
         return False
     window = render.data_window
     if area is not None:
         window = area.shift(render.display_window.x0, render.display_window.y0).intersect(window)
-    tops = range(window.y0, window.y1, ROWS)
-    parts = (Window(window.x0, top, window.x1, min(top + ROWS, window.y1)) for top in tops)
-    return not any(np.any(pixels) for part in parts for pixels in render.read(part, [name]).values())
+    return not any(np.any(pixels) for part in window.bands(ROWS) for pixels in render.read(part, [name]).values())

@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from oiio_msspl.fusion.tiles.guards import LAYER_REACH
 from oiio_msspl.image.arrays import Array, planes_of
 from oiio_msspl.image.filters import blurred, box_downsample, grown, max_3x3
-from oiio_msspl.image.parallel import for_row_blocks
+from oiio_msspl.image.parallel import for_row_blocks, two_at_a_time
 
 #: Rows of a band whose weights stay in a core's cache while several planes are averaged.
 CACHED_ROWS = 16
@@ -31,32 +31,6 @@ RIDGE = 0.03
 NO_SAMPLE = 0.25
 #: Variance of the logarithm of the fused beauty that counts as flat where albedo and normal are smoothed.
 FLAT = 0.001
-
-
-class LineFit:
-    """Lines ``layer = slope beauty + offset`` around every low-resolution pixel, fitted to pixels that look alike."""
-
-    def __init__(self, beauty: Array, guides: Array, steps: Sequence[int]) -> None:
-        """``beauty``: (3, h, w). ``guides``: (guides, h, w), in units of their spread."""
-        self._beauty, self._steps = beauty, steps
-        self._kernels = [_kernel(guides, step) for step in steps]
-        means = self._mean(np.concatenate([beauty, beauty * beauty]))
-        self._means = means[:3]
-        variances = np.maximum(means[3:] - self._means**2, 0)
-        self._variances = variances + RIDGE * (variances + self._means**2) + np.float32(1e-20)
-
-    def lines(self, layer: Array) -> tuple[Array, Array]:
-        """Return the slopes of a layer (3, h, w) and then its offsets, (6, h, w); and its means (3, h, w)."""
-        means = self._mean(np.concatenate([layer, layer * self._beauty]))
-        mean, products = means[:3], means[3:]
-        slopes = (products - mean * self._means) / self._variances
-        return np.concatenate([slopes, mean - slopes * self._means]), mean
-
-    def _mean(self, planes: Array) -> Array:
-        """Return means (n, h, w) over pixels around that look alike."""
-        for kernel, step in zip(self._kernels, self._steps, strict=True):
-            planes = _mean_around(planes, kernel, step)
-        return planes
 
 
 def _mean_around(planes: Array, weights: Array, step: int) -> Array:
@@ -193,19 +167,19 @@ def _between(first: Array, second: Array, weight: float) -> Array:
 class BeautyFit:
     """The fused beauty of some rows, to which layers at the LRHS's resolution are fitted.
 
-    Args:
-        beauty: the fused one, (3, h, w).
-        guides: planes (guides, h, w) in units of their spread.
-        scale: layers have 1/scale of this resolution.
-        steps: see :data:`STEPS`.
-        rows: the rows of the layers that are wanted.
+    A layer is ``slope beauty + offset`` around every low-resolution pixel, fitted to pixels that look alike.
     """
 
     def __init__(self, beauty: Array, guides: Array, scale: int, steps: Sequence[int], rows: slice) -> None:
-        self._scale = scale
-        low = downsampled(guides, scale)
+        """``beauty``: (3, h, w). ``guides``: (n, h, w), in units of their spread. ``rows``: of the layers, to fit."""
+        low, self._low_beauty = downsampled(guides, scale), downsampled(beauty, scale)
         with np.errstate(over="ignore", invalid="ignore"):
-            self._lines = LineFit(downsampled(beauty, scale), low, steps)
+            self._kernels = {step: _kernel(low, step) for step in steps}
+            means = self._mean(np.concatenate([self._low_beauty, self._low_beauty * self._low_beauty]))
+            self._means = means[:3]
+            variances = np.maximum(means[3:] - self._means**2, 0)
+            self._variances = variances + RIDGE * (variances + self._means**2) + np.float32(1e-20)
+        self._reach = LAYER_REACH // scale - 2
         self._nearby = LinesNearby(low, guides, scale, rows)
         self._beauty = self._nearby.phases(beauty[:, rows.start * scale : rows.stop * scale])
 
@@ -222,20 +196,29 @@ class BeautyFit:
             # NumPy's settings for errors belong to the thread.
             with np.errstate(over="ignore", invalid="ignore"):
                 for layer, out in zip(layers[part], results[part], strict=True):
-                    fit_layer(layer, out)
-
-        def fit_layer(layer: Array, out: Array) -> None:
-            lines, means = self._lines.lines(layer)
-            # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
-            lowest, highest = (np.stack([sign * max_3x3(sign * plane) for plane in layer]) for sign in (-1, 1))
-            if few_samples:
-                # Where a rare light has no sample by chance, the mean over pixels that look alike is the bound. This
-                # ends two LRHS pixels before LAYER_REACH, because the bounds are interpolated.
-                near_light = grown(np.any(layer != 0, axis=0), LAYER_REACH // self._scale - 2)
-                highest = np.where(near_light & (highest < means * np.float32(NO_SAMPLE)), means, highest)
-            self._nearby.apply(lines, np.concatenate([lowest, highest]), self._beauty, out)
+                    self._fit(layer, out, few_samples)
 
         for_row_blocks(fit, len(layers), self._beauty.size)
+
+    def _fit(self, layer: Array, out: Array, few_samples: bool) -> None:
+        means = self._mean(np.concatenate([layer, layer * self._low_beauty]))
+        mean, products = means[:3], means[3:]
+        slopes = (products - mean * self._means) / self._variances
+        # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
+        lowest, highest = (np.stack([sign * max_3x3(sign * plane) for plane in layer]) for sign in (-1, 1))
+        if few_samples:
+            # Where a rare light has no sample by chance, the mean over pixels that look alike is the bound. This
+            # ends two LRHS pixels before LAYER_REACH, because the bounds are interpolated.
+            near_light = grown(np.any(layer != 0, axis=0), self._reach)
+            highest = np.where(near_light & (highest < mean * np.float32(NO_SAMPLE)), mean, highest)
+        lines = np.concatenate([slopes, mean - slopes * self._means])
+        self._nearby.apply(lines, np.concatenate([lowest, highest]), self._beauty, out)
+
+    def _mean(self, planes: Array) -> Array:
+        """Return means (n, h, w) over pixels around that look alike."""
+        for step, kernel in self._kernels.items():
+            planes = _mean_around(planes, kernel, step)
+        return planes
 
 
 def smoothed(planes: Array, log: Array) -> Array:
@@ -245,16 +228,13 @@ def smoothed(planes: Array, log: Array) -> Array:
     """
     mean = blurred(log)
     variance = blurred(log * log) - mean * mean + np.float32(FLAT)
-    result = np.empty_like(planes)
 
-    def smooth(part: slice) -> None:
-        for plane, out in zip(planes[part], result[part], strict=True):
-            average = blurred(plane)
-            slope = (blurred(plane * log) - average * mean) / variance
-            np.add(average, slope * (log - mean), out=out)
+    def smooth(plane: Array) -> Array:
+        average = blurred(plane)
+        slope = (blurred(plane * log) - average * mean) / variance
+        return average + slope * (log - mean)
 
-    for_row_blocks(smooth, len(planes), log.size)
-    return result
+    return np.stack(two_at_a_time(smooth, list(planes)))
 
 
 def downsampled(planes: Array, scale: int) -> Array:

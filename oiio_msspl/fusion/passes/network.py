@@ -6,8 +6,7 @@ That is more accurate than a fit, and takes a run of the network for each layer.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -39,87 +38,16 @@ HALF_STEPS = (1,)
 LayerFuser = Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]]
 
 
-class AtFullSize:
-    """Layers that a network fuses at the frame's resolution."""
-
-    def __init__(self, low: Render, high: Render, alignment: Alignment) -> None:
-        self._low, self._high, self.alignment = low, high, alignment
-        self.light: dict[AdditiveLayer, Array] = {}
-
-    def pair(self, name: str) -> tuple[Render, Render]:
-        """Return both renders with a layer in place of the beauty."""
-        return _as_beauty(self._low, name), _as_beauty(self._high, name)
-
-    def estimate(self, band: Band, job: PassJob, out: Array) -> list[int]:
-        """Copy the fused light, see :meth:`LayersByNetwork.estimate`."""
-        fused = [i for i, layer in enumerate(job.estimated) if layer in self.light]
-        for i in fused:
-            out[i] = band.over_core(self.light[job.estimated[i]])
-        return fused
-
-
-class AtHalfSize:
-    """Layers of an x2 pair that a network fuses at the LRHS's resolution, and that are fitted to the beauty then.
-
-    The HRLS is averaged over 2 x 2 pixels, over the whole grid.
-    """
-
-    def __init__(self, low: Render, high: Render, alignment: Alignment) -> None:
-        self._low, self._high = low, high
-        self.alignment = replace(alignment, scale=1, hr_data_window=alignment.grid)
-        self._data_window = alignment.hr_data_window
-        self._guides = {name: self._half_of(name) for name in (ALBEDO, NORMAL) if name in high.layers}
-        self.light: dict[AdditiveLayer, Array] = {}
-
-    def pair(self, name: str) -> tuple[Render, Render]:
-        """Return both renders with a layer in place of the beauty."""
-        window = self.alignment.grid
-        frame = Window(0, 0, window.x1, window.y1)
-        half = Render({RGB: self._half_of(name), **self._guides}, window, frame, name=self._high.name)
-        return _as_beauty(self._low, name), half
-
-    def estimate(self, band: Band, job: PassJob, out: Array) -> list[int]:
-        """Fit the fused light to the beauty, and draw the fit towards it, see :meth:`LayersByNetwork.estimate`."""
-        fused = [i for i, layer in enumerate(job.estimated) if layer in self.light]
-        if fused and band.needs_fit(job):
-            area = band.area.slices(self.alignment.grid)
-            low = [planes_of(self.light[job.estimated[i]][area]) for i in fused]
-            band.fit_at(HALF_STEPS).fit_layers(low, [out[i] for i in fused])
-            for i, means in zip(fused, low, strict=True):
-                _draw_towards(out[i], means[:, band.rows])
-        return fused
-
-    def _half_of(self, name: str) -> Array:
-        image, window = self._high.layers[name], self.alignment.grid
-        result: Array = blank((window.height, window.width, image.shape[-1]))
-        for top in range(window.y0, window.y1, BAND_ROWS):
-            part = Window(window.x0, top, window.x1, min(top + BAND_ROWS, window.y1))
-            full = mirrored(image, self._data_window, in_hrls_pixels(part, HALF))
-            result[part.slices(window)] = box_downsample(full, HALF)
-        unload(image)
-        unload(result)
-        return result
-
-
 class LayersByNetwork:
-    """The layers of a frame that a network fuses, in either way.
-
-    Args:
-        sources: of the frame, decoded if there is a network.
-        jobs: the sets.
-        fuse: the network; None if there is none.
-    """
+    """The layers of a frame that a network fuses, at full or at half of the resolution."""
 
     def __init__(self, sources: PassSources, jobs: Sequence[PassJob], fuse: LayerFuser | None) -> None:
-        self._fuse, self._scale = fuse if any(job.lrhs for job in jobs) else None, sources.alignment.scale
+        """``sources``: decoded if there is a network, ``fuse``."""
+        self._fuse, self._alignment = fuse if any(job.lrhs for job in jobs) else None, sources.alignment
         self._renders = cast(tuple[Render, Render], (sources.low, sources.high))
-        self._full_size = AtFullSize(*self._renders, sources.alignment)
-        self._ways: list[AtFullSize | AtHalfSize] = [self._full_size]
-
-    @property
-    def at_full_size(self) -> Collection[AdditiveLayer]:
-        """The layers that were fused at full resolution."""
-        return self._full_size.light
+        self.at_full_size: dict[AdditiveLayer, Array] = {}
+        """Layers that were fused at full resolution, (height, width, 3) over the HRLS's data window."""
+        self._at_half_size: dict[AdditiveLayer, Array] = {}
 
     def count(self, job: PassJob) -> int:
         """Return how many layers :meth:`fuse` yields."""
@@ -136,40 +64,73 @@ class LayersByNetwork:
         lit = {layer: job.names[layer] for layer in job.estimated if job.names[layer] in job.lrhs}
         lit = {layer: name for layer, name in lit.items() if not any(is_black(x, name) for x in self._renders)}
         self.unload()
-        way = self._way(job, len(lit))
-        fused = self._fuse((way.pair(name) for name in lit.values()), way.alignment)
+        half = self._alignment.scale == HALF and job.layers.name == LIGHT_GROUPS and len(lit) > MOST_AT_FULL_SIZE
+        alignment = self._alignment
+        if half:
+            alignment = replace(alignment, scale=1, hr_data_window=alignment.grid)
+        fused = self._fuse(self._pairs(lit.values(), half=half), alignment)
         for layer in job.estimated:
             if layer in lit:
-                way.light[layer] = light = next(fused)
+                light = next(fused)
                 for channel in range(3):
                     if not any((render.layers[lit[layer]][..., channel] > 0).any() for render in self._renders):
                         light[..., channel] = 0  # a saturated lamp gets no light of another colour
                 unload(light)
+                (self._at_half_size if half else self.at_full_size)[layer] = light
             yield layer
 
-    def _way(self, job: PassJob, count: int) -> AtFullSize | AtHalfSize:
-        """Choose how to fuse a set of which so many layers have light."""
-        if self._scale != HALF or job.layers.name != LIGHT_GROUPS or count <= MOST_AT_FULL_SIZE:
-            return self._full_size
-        self._ways.append(AtHalfSize(*self._renders, self._full_size.alignment))
-        return self._ways[-1]
+    def _pairs(self, names: Iterable[str], *, half: bool) -> Iterator[tuple[Render, Render]]:
+        """Yield both renders with a layer in place of the beauty; the HRLS at half of its resolution if ``half``."""
+        low, high = self._renders
+        guides, high_guides = ({n: x.layers[n] for n in (ALBEDO, NORMAL) if n in x.layers} for x in self._renders)
+        if half:
+            grid = self._alignment.grid
+            high = replace(high, data_window=grid, display_window=Window(0, 0, grid.x1, grid.y1))
+            high_guides = {name: _half_of(image, self._alignment) for name, image in high_guides.items()}
+        for name in names:
+            light = _half_of(high.layers[name], self._alignment) if half else high.layers[name]
+            yield (
+                replace(low, layers={RGB: low.layers[name], **guides}),
+                replace(high, layers={RGB: light, **high_guides}),
+            )
 
     def estimate(self, band: Band, job: PassJob, out: Array) -> set[int]:
-        """Put the fused layers of a set into ``out``, (layers, 3, h, w) over the core of a band. Return which ones."""
-        return {i for way in self._ways for i in way.estimate(band, job, out)}
+        """Put the fused layers of a set into ``out``, (layers, 3, h, w) over the core of a band. Return which ones.
+
+        Those at half of the resolution are fitted to the beauty, and the fit is drawn towards them.
+        """
+        full, half = (
+            {i: light[layer] for i, layer in enumerate(job.estimated) if layer in light}
+            for light in (self.at_full_size, self._at_half_size)
+        )
+        for i, light in full.items():
+            out[i] = band.sources.planes(light, band.hrls_core)
+        if half and job in band.to_fit:
+            area = band.area.slices(self._alignment.grid)
+            low = [planes_of(light[area]) for light in half.values()]
+            band.fit_at(HALF_STEPS).fit_layers(low, [out[i] for i in half])
+            for i, means in zip(half, low, strict=True):
+                _draw_towards(out[i], means[:, band.rows])
+        return {*full, *half}
 
     def unload(self) -> None:
         """Give the memory of pixels that wait in temporary files back to the system."""
         for render in self._renders:
             render.unload()
-        for image in itertools.chain.from_iterable(way.light.values() for way in self._ways):
+        for image in (*self.at_full_size.values(), *self._at_half_size.values()):
             unload(image)
 
 
-def _as_beauty(render: Render, name: str) -> Render:
-    """Return a render with a layer in place of the beauty."""
-    guides = {guide: render.layers[guide] for guide in (ALBEDO, NORMAL) if guide in render.layers}
-    return replace(render, layers={RGB: render.layers[name], **guides})
+def _half_of(image: Array, alignment: Alignment) -> Array:
+    """Average an image over the HRLS's data window over 2 x 2 pixels, over the whole grid."""
+    grid = alignment.grid
+    result: Array = blank((grid.height, grid.width, image.shape[-1]))
+    for part in grid.bands(BAND_ROWS):
+        full = mirrored(image, alignment.hr_data_window, in_hrls_pixels(part, HALF))
+        result[part.slices(grid)] = box_downsample(full, HALF)
+    unload(image)
+    unload(result)
+    return result
 
 
 def _draw_towards(image: Array, means: Array) -> None:

@@ -70,11 +70,7 @@ class PassPlan:
 
 
 def plan_passes(low: LayerLight, high: LayerLight, sets: Sequence[AdditiveSet]) -> PassPlan:
-    """Find the sets that sum to the beauty.
-
-    Args:
-        low, high: the light of all layers of the sets, in either render.
-        sets: of the HRLS.
+    """Find the sets of the HRLS that sum to its beauty, given the light of all their layers in either render.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -89,7 +85,7 @@ def plan_passes(low: LayerLight, high: LayerLight, sets: Sequence[AdditiveSet]) 
             continue
         # All derived layers come from one set. Those of two sets could have more light than the beauty.
         derived = max((_sums_of(high, layers.layers, job.layers) for job in plan.jobs), key=len, default={})
-        taken = _channels_of(plan.jobs)
+        taken = {channel for job in plan.jobs for channel in job.channels}
         shared = [x.name for x in layers.layers if x not in derived and not taken.isdisjoint(x.channels)]
         if shared:
             plan.refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
@@ -103,16 +99,12 @@ def plan_passes(low: LayerLight, high: LayerLight, sets: Sequence[AdditiveSet]) 
             )
         elif lrhs and job.hrls_alone:
             plan.warnings.append(f"{layers.name}: the LRHS lacks {job.hrls_alone}, so more noise is left there")
-    taken = _channels_of(plan.jobs)
+    taken = {channel for job in plan.jobs for channel in job.channels}
     for job in plan.jobs:
         for layer in job.layers.coarser:
             if taken.isdisjoint(layer.channels):
                 job.coarser.update(_sums_of(high, [layer], job.layers))
     return plan
-
-
-def _channels_of(jobs: Sequence[PassJob]) -> set[Channel]:
-    return {channel for job in jobs for channel in job.channels}
 
 
 def _sums_of(high: LayerLight, layers: Sequence[AdditiveLayer], finer: AdditiveSet) -> Sums:

@@ -14,7 +14,6 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import LOSSLESS
 from oiio_msspl.fusion.passes.layers import LayerLight, layer_names, light_of
 from oiio_msspl.image.arrays import HALF_MAX, Array
@@ -74,8 +73,6 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
     """Compare the sum of a set's layers with the beauty, or with another layer, on some strips of rows.
 
     Args:
-        light: has the layers.
-        additive_set: the layers to add up.
         total: what they should sum to; None for the beauty. Then the check also says which layers are too many.
 
     Raises:
@@ -118,9 +115,7 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
 
 
 def is_sum_of(light: LayerLight, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:
-    """Return whether a layer is the sum of others of the same file, on some strips of rows.
-
-    A layer with another data window than the beauty's is no sum.
+    """Return whether a layer over the beauty's data window is the sum of others, on some strips of rows.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -185,26 +180,20 @@ def _lossy_compression(render: MappedRender, layers: Sequence[AdditiveLayer]) ->
 def _strips_of(
     light: LayerLight, layers: Sequence[AdditiveLayer], total: AdditiveLayer | None = None
 ) -> Iterator[_Strip]:
-    """Yield strips from top to bottom."""
     window, names = light.file.data_window, [light.names[layer] for layer in layers]
     whole = RGB if total is None else light.names[total]
     channels: Sequence[Channel] = light.file.beauty_channels if total is None else total.channels
     # Where a beauty of half floats is clipped, its layers have more light.
     brightest = HALF_MAX if channels[0].type == "half" else np.inf
-    windows = (Window(window.x0, y, window.x1, min(y + ROWS, window.y1)) for y in _first_rows(window))
-    for features in one_ahead(light.pixels.read(rows, [whole, *names]) for rows in windows):
+    strips = list(window.bands(ROWS))
+    if window.height > STRIPS * ROWS:
+        last = (window.height - ROWS) // ROWS
+        strips = [strips[round(i * last / (STRIPS - 1))] for i in range(STRIPS)]
+    for features in one_ahead(light.pixels.read(strip, [whole, *names]) for strip in strips):
         sought, pixels = features[whole].astype(np.float64), [features[name] for name in names]
         with np.errstate(invalid="ignore", over="ignore"):
             rest = sought - sum(pixels)
         yield _Strip(pixels, sought, rest, np.isfinite(rest) & (sought < brightest))
-
-
-def _first_rows(window: Window) -> list[int]:
-    """Return the first rows of the strips that are compared."""
-    if window.height <= STRIPS * ROWS:
-        return list(range(window.y0, window.y1, ROWS))
-    last = (window.height - ROWS) // ROWS
-    return [window.y0 + round(i * last / (STRIPS - 1)) * ROWS for i in range(STRIPS)]
 
 
 def _equal_pixels(pixels: Array) -> tuple[int, int]:
@@ -212,13 +201,12 @@ def _equal_pixels(pixels: Array) -> tuple[int, int]:
     red, green, blue = np.moveaxis(pixels, -1, 0)
     with np.errstate(invalid="ignore", over="ignore"):
         light = red + green + blue
-    lit = light > 0
-    equal = np.zeros_like(lit)
-    for values, result in ((light, equal), (light.T, equal.T)):
-        with np.errstate(invalid="ignore", over="ignore"):
+        lit = light > 0
+        equal = np.zeros_like(lit)
+        for values, result in ((light, equal), (light.T, equal.T)):
             same = np.abs(values[1:] - values[:-1]) <= np.float32(EQUAL / 2) * (values[1:] + values[:-1])
-        result[1:] |= same
-        result[:-1] |= same
+            result[1:] |= same
+            result[:-1] |= same
     return int(np.count_nonzero(equal & lit)), int(np.count_nonzero(lit))
 
 

@@ -75,7 +75,7 @@ def read_tile(
     hr: ReadableRender,
     alignment: Alignment,
     features: Iterable[str],
-    counts: RepairCounts,
+    counts: RepairCounts | None = None,
 ) -> TileFeatures:
     """Read both renders over a tile.
 
@@ -95,8 +95,7 @@ def read_tile(
     lost = _infinite(hrls[RGB])
     if lost.any():
         lost &= ~_as_bright(low[RGB]).repeat(scale, axis=0).repeat(scale, axis=1)
-    if RGB in broken:
-        lost |= broken[RGB]
+    lost |= broken.get(RGB, False)
     if lost.any():
         hrls[RGB] = np.where(lost[..., None], enlarged(low[RGB], scale), hrls[RGB])
     lost_below = _infinite(low[RGB])
@@ -134,7 +133,7 @@ def read_lrhs(
     alignment: Alignment,
     grid: Window,
     features: Iterable[str],
-    counts: RepairCounts,
+    counts: RepairCounts | None = None,
     *,
     exact: bool = False,
 ) -> dict[str, Array]:
@@ -197,11 +196,11 @@ def read_features(
     result = {}
     for name, values in layers.items():
         repaired, bad = repair(values, signed=name in SIGNED_FEATURES)
-        if bad is not None and counts is not None and counted is not None:
-            inside = counted.intersect(stored).slices(stored)
-            counts.add(name, values[inside], bad[inside])
-        missing = None if bad is None else np.any(np.isnan(values) | np.isneginf(values), axis=-1)
-        if missing is not None and missing.any():
+        if bad is not None:
+            if counts is not None and counted is not None:
+                inside = counted.intersect(stored).slices(stored)
+                counts.add(name, values[inside], bad[inside])
+            missing = np.any(np.isnan(values) | np.isneginf(values), axis=-1)
             repaired = filled(repaired, missing)
             if broken is not None:
                 broken[name] = _at(missing, rows - stored.y0, columns - stored.x0)
@@ -237,17 +236,12 @@ def _at(values: NDArray[T], rows: Indices, columns: Indices) -> NDArray[T]:
 
 def _mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
     """Return the rows and columns of ``inside`` that a window shows if the picture is mirrored at its sides."""
+    rows = (np.arange(window.y0, window.y1) - inside.y0) % (2 * inside.height)
+    columns = (np.arange(window.x0, window.x1) - inside.x0) % (2 * inside.width)
     return (
-        _mirrored_line(np.arange(window.y0, window.y1), inside.y0, inside.y1),
-        _mirrored_line(np.arange(window.x0, window.x1), inside.x0, inside.x1),
+        inside.y0 + np.minimum(rows, 2 * inside.height - 1 - rows),
+        inside.x0 + np.minimum(columns, 2 * inside.width - 1 - columns),
     )
-
-
-def _mirrored_line(pixels: Indices, start: int, stop: int) -> Indices:
-    """Return the pixels from ``start`` to ``stop`` that indices show if the line is mirrored at both ends."""
-    length = stop - start
-    offsets = (pixels - start) % (2 * length)
-    return start + np.minimum(offsets, 2 * length - 1 - offsets)
 
 
 def in_hrls_pixels(window: Window, scale: int) -> Window:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.alpha import fuse_alpha
 from oiio_msspl.fusion.tiles.guards import LAYER_REACH, check_finite
-from oiio_msspl.fusion.tiles.prepare import FramePair, FrameShares, PreparedTile
+from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
 from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
@@ -49,7 +50,8 @@ class TileTask:
     """A tile that is ready for the network, and the result into which it is written."""
 
     tile: PreparedTile
-    shares: FrameShares
+    shares: tuple[Shares, Shares]
+    """Of colour and alpha, see :meth:`FramePair.sample_shares`."""
     result: FusedPixels
     number: int
     """Tiles of the result up to this one."""
@@ -70,24 +72,21 @@ def tile_tasks(
         yield TileTask(prepared, shares, result, number, len(tiles))
 
 
-def fuse_tiles(tasks: Iterable[TileTask], session: Session) -> Iterator[tuple[FusedPixels, int, int]]:
-    """Run the network on each tile and write it into its result. The next tile is prepared meanwhile.
-
-    Yields:
-        After each tile: its result, the number of the tile, and the number of tiles of this result.
-    """
+def fuse_tiles(tasks: Iterable[TileTask], session: Session) -> Iterator[TileTask]:
+    """Run the network on each tile, write it into its result, and yield it. The next tile is prepared meanwhile."""
     for task in one_ahead(tasks):
-        _fuse_tile(task.tile, session, task.result, task.shares)
-        yield task.result, task.number, task.count
+        _fuse_tile(task, session)
+        yield task
 
 
-def _fuse_tile(tile: PreparedTile, session: Session, result: FusedPixels, shares: FrameShares) -> None:
+def _fuse_tile(task: TileTask, session: Session) -> None:
     """Run the network on a tile and write its core into the result."""
+    tile, result, (shares, alpha_shares) = task.tile, task.result, task.shares
     features, empty = tile.features, tile.empty
     target = features.hrls_target.slices(result.alignment.hr_data_window)
     core = features.hrls_target.slices(features.hrls_area)
     if tile.hrls is not None:
-        images = _run_network(tile, session, result.exposure, shares.rgb, error=result.error is not None)
+        images = _run_network(tile, session, result.exposure, shares, error=result.error is not None)
         for name in tile.aovs:
             if name not in result.clean_aovs:
                 result.clean_aovs[name] = blank(result.rgb.shape, np.float16)
@@ -110,7 +109,7 @@ def _fuse_tile(tile: PreparedTile, session: Session, result: FusedPixels, shares
     if "alpha" in features.hrls:
         if result.alpha is None:
             result.alpha = np.empty((*result.rgb.shape[:2], 1), dtype=np.float32)
-        result.alpha[target] = fuse_alpha(features, session, shares.alpha)[core]
+        result.alpha[target] = fuse_alpha(features, session, alpha_shares)[core]
 
 
 def _run_network(tile: PreparedTile, session: Session, exposure: float, shares: Shares, *, error: bool) -> Images:
@@ -134,8 +133,15 @@ def _scene_linear_error(rgb: Array, error: Array, exposure: float) -> Array:
     return decode_radiance(grey + error, exposure) - decode_radiance(grey, exposure)
 
 
-def fuse_layers(
-    renders: Iterable[tuple[Render, Render]], session: Session, alignment: Alignment, exposure: float, reach: int
+def layer_fuser(
+    session: Session, beauty: FusedPixels
+) -> Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]] | None:
+    """Return a function that fuses passes of a frame whose beauty ``session`` has fused; None if no network does."""
+    return None if session.layers is None else partial(_fuse_layers, session, beauty)
+
+
+def _fuse_layers(
+    session: Session, beauty: FusedPixels, renders: Iterable[tuple[Render, Render]], alignment: Alignment
 ) -> Iterator[Array]:
     """Fuse passes of a frame, such as the light of each lamp.
 
@@ -144,10 +150,7 @@ def fuse_layers(
     Args:
         renders: LRHS and HRLS with a pass in place of the beauty, for each pass. The next two are taken in the
             background while the network works.
-        session: a model for the scale of the renders.
         alignment: of the renders.
-        exposure: that of the beauty, because networks tell light from noise by its brightness.
-        reach: see :class:`oiio_msspl.fusion.tiles.guards.EmptyRegions`.
 
     Yields:
         The fused passes, (height, width, 3) over the HRLS's data window, finite and >= 0: in temporary files if they
@@ -157,37 +160,25 @@ def fuse_layers(
         InputError: pixels can't be decoded.
         MssplError: the network failed, or returned NaN or infinite values.
     """
+    whole = alignment.scale == beauty.alignment.scale
+    layer_session = session.layer_session if whole else session.half_layer_session
+    assert layer_session is not None
+    # Networks tell light from noise by its brightness, so the exposure is that of the beauty.
+    of_pass = (beauty.exposure, max(LAYER_REACH // beauty.alignment.scale - 1, 1))
     size = alignment.hr_data_window.height, alignment.hr_data_window.width
 
     def tasks() -> Iterator[TileTask]:
         for lr, hr in renders:
             # The network works at the same time, and has threads on all cores.
             with half_of_the_threads():
-                pair = FramePair(lr, hr, alignment, session.contract, of_pass=(exposure, reach))
-            result = FusedPixels(blank((*size, 3)), None, None, alignment, exposure)
+                pair = FramePair(lr, hr, alignment, layer_session.contract, of_pass=of_pass)
+            result = FusedPixels(blank((*size, 3)), None, None, alignment, beauty.exposure)
             for task in tile_tasks(pair, result, half_of_the_threads):
                 for render in (lr, hr):
                     render.unload()
                 yield task
 
-    for result, number, count in fuse_tiles(tasks(), session):
-        unload(result.rgb)
-        if number == count:
-            yield result.rgb
-
-
-def layer_fuser(
-    session: Session, beauty: FusedPixels
-) -> Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]] | None:
-    """Return a function that fuses passes of a frame whose beauty ``session`` has fused; None if no network does."""
-    if session.layers is None:
-        return None
-
-    def fuse_passes(renders: Iterable[tuple[Render, Render]], alignment: Alignment) -> Iterator[Array]:
-        whole = alignment.scale == beauty.alignment.scale
-        layer_session = session.layer_session if whole else session.half_layer_session
-        assert layer_session is not None
-        reach = max(LAYER_REACH // beauty.alignment.scale - 1, 1)
-        return fuse_layers(renders, layer_session, alignment, beauty.exposure, reach)
-
-    return fuse_passes
+    for task in fuse_tiles(tasks(), layer_session):
+        unload(task.result.rgb)
+        if task.number == task.count:
+            yield task.result.rgb

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.exr.render import ReadableRender, Window
@@ -17,14 +17,6 @@ from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.encoding import find_exposure
 from oiio_msspl.model.render_mean import Images, Shares, find_shares
-
-
-@dataclass(frozen=True)
-class FrameShares:
-    """The LRHS's shares in the mean of both renders, which many models denoise."""
-
-    rgb: Shares = field(default_factory=dict)
-    alpha: Shares = field(default_factory=dict)
 
 
 @dataclass
@@ -68,22 +60,19 @@ class FramePair:
         aovs: Sequence[str] = (),
         *,
         of_pass: tuple[float, int] | None = None,
-        on_read: Callable[[TileFeatures], object] | None = None,
+        on_read: Callable[[TileFeatures], object] = lambda _: None,
     ) -> None:
         self._lr, self._hr, self._alignment, self._contract = lr, hr, alignment, contract
         self._aovs, self._on_read = aovs, on_read
         self.grid = network_grid(alignment, contract)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         self._lrhs = read_lrhs(lr, alignment, self.grid, [*contract.lrhs, "alpha"], self._lrhs_counts)
+        self.lrhs_has_alpha = "alpha" in self._lrhs
         self.lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
         """Colour of the LRHS (h, w, 3) over the grid of the alignment."""
         self.exposure, reach = of_pass or (find_exposure(self.lrhs_rgb), FAR)
         self._empty_regions = EmptyRegions(self._lrhs[RGB], reach, of_pass=of_pass is not None)
         self._part = self._lit_part(reach) if of_pass else None
-
-    @property
-    def lrhs_has_alpha(self) -> bool:
-        return "alpha" in self._lrhs
 
     def counts(self, kind: str) -> dict[str, int]:
         """Return the numbers of values that were ``repaired`` or ``negative``, by render and feature (``lrhs.rgb``)."""
@@ -97,8 +86,7 @@ class FramePair:
     def prepare(self, tile: Tile) -> PreparedTile:
         """Read a tile and apply the guards."""
         features = self._read(tile, [*self._contract.hrls, "alpha"], self._hrls_counts)
-        if self._on_read is not None:
-            self._on_read(features)
+        self._on_read(features)
         empty = self._empty_regions.mask(features, tile.area.slices(self.grid))
         guides = {name: values for name, values in features.hrls.items() if name in (ALBEDO, NORMAL, "alpha")}
         aovs = tuple(name for name in self._aovs if name in features.hrls)
@@ -111,18 +99,21 @@ class FramePair:
             prepared.noise_free = is_noise_free(features, lrhs_rgb, prepared.hrls[RGB], self.exposure)
         return prepared
 
-    def sample_shares(self) -> FrameShares:
-        """Decide how both renders are averaged, from bands of the frame, so that neighbouring tiles agree."""
+    def sample_shares(self) -> tuple[Shares, Shares]:
+        """Return the LRHS's shares in the mean of both renders, of colour and of alpha, which many models denoise.
+
+        They come from bands of the frame, so that neighbouring tiles agree.
+        """
         if not self._contract.denoiser:
-            return FrameShares()
+            return {}, {}
         colours, alphas = [], []
         for band in sample_bands(self._alignment.grid, self._contract.scale):
-            features = self._read(Tile(band, band), [RGB, ALBEDO, NORMAL, "alpha"], RepairCounts())
+            features = self._read(Tile(band, band), [RGB, ALBEDO, NORMAL, "alpha"])
             lrhs_rgb, hrls = dim_fireflies(features)
             colours.append((features.lrhs | {RGB: lrhs_rgb}, hrls))
             if "alpha" in features.lrhs and "alpha" in features.hrls:
                 alphas.append(alpha_as_colour(features))
-        return FrameShares(find_shares(colours, self.exposure), find_shares(alphas, 1.0) if alphas else {})
+        return find_shares(colours, self.exposure), find_shares(alphas, 1.0) if alphas else {}
 
     def exact_lrhs_rgb(self) -> Array:
         """Return the colour of the LRHS at the places of its HRLS pixels, (h, w, 3) over the grid of the alignment.
@@ -131,9 +122,9 @@ class FramePair:
         """
         if self._alignment.stretch == (1.0, 1.0):
             return self.lrhs_rgb
-        return read_lrhs(self._lr, self._alignment, self._alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
+        return read_lrhs(self._lr, self._alignment, self._alignment.grid, [RGB], exact=True)[RGB]
 
-    def _read(self, tile: Tile, features: Sequence[str], counts: RepairCounts) -> TileFeatures:
+    def _read(self, tile: Tile, features: Sequence[str], counts: RepairCounts | None = None) -> TileFeatures:
         return read_tile(tile, self._lrhs, self.grid, self._hr, self._alignment, features, counts)
 
     def _lit_part(self, reach: int) -> Window | None:

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
@@ -90,11 +91,8 @@ def plan_tiles(grid: Window, contract: Contract, part: Window | None = None) -> 
 
 def _aligned_part(part: Window, grid: Window, alignment: int) -> Window:
     """Extend a part of a grid to multiples of ``alignment``, or to the end of the grid."""
-    x0, y0 = (
-        (start - first) // alignment * alignment + first for start, first in ((part.x0, grid.x0), (part.y0, grid.y0))
-    )
-    x1, y1 = (start - (start - end) // alignment * alignment for start, end in ((x0, part.x1), (y0, part.y1)))
-    return Window(x0, y0, x1, y1).intersect(grid)
+    x0, y0 = part.x0 - (part.x0 - grid.x0) % alignment, part.y0 - (part.y0 - grid.y0) % alignment
+    return aligned_grid(Window(x0, y0, part.x1, part.y1), alignment).intersect(grid)
 
 
 def sample_bands(grid: Window, scale: int) -> list[Window]:
@@ -121,12 +119,6 @@ def tile_bytes(alignment: Alignment, contract: Contract) -> int:
     return pixels * contract.scale**2 * contract.bytes_per_pixel
 
 
-def lrhs_bytes(alignment: Alignment, contract: Contract) -> int:
-    """Return the bytes of the LRHS in memory, with all features that the model may read."""
-    grid = network_grid(alignment, contract)
-    return grid.width * grid.height * (3 * len(contract.lrhs) + 1) * 4  # alpha has 1 channel, other features have 3
-
-
 def result_bytes(alignment: Alignment, *, error: bool) -> int:
     """Return the bytes of a fused frame in float32: colour, alpha (even if there is none), perhaps the error."""
     return alignment.hr_data_window.width * alignment.hr_data_window.height * (5 if error else 4) * 4
@@ -134,8 +126,10 @@ def result_bytes(alignment: Alignment, *, error: bool) -> int:
 
 def memory_to_fuse(alignment: Alignment, contract: Contract, *, error: bool) -> int:
     """Return the smallest ``max_memory`` with which a frame can be fused, from its headers."""
-    frame = result_bytes(alignment, error=error) + lrhs_bytes(alignment, contract)
-    return FIXED_MEMORY + frame + tile_bytes(alignment, contract)
+    grid = network_grid(alignment, contract)
+    # The LRHS lies in memory, with all features that the model may read: alpha has 1 channel, the others have 3.
+    lrhs = grid.width * grid.height * (3 * len(contract.lrhs) + 1) * 4
+    return FIXED_MEMORY + result_bytes(alignment, error=error) + lrhs + tile_bytes(alignment, contract)
 
 
 def strips_memory(max_memory: int, held: int) -> int:
@@ -152,15 +146,12 @@ def require_memory(needed: int, contract: Contract, max_memory: int, hint: str =
         )
 
 
-@dataclass(frozen=True)
-class _Split:
-    """A side of the grid, cut into ranges of pixels."""
+class _Split(NamedTuple):
+    """A side of the grid, cut into ranges of pixels: the ranges, and the longest and all of them with their overlap."""
 
     cores: list[tuple[int, int]]
     largest: int
-    """Length of the longest range with its overlap."""
     computed: int
-    """Length of all ranges with their overlap."""
 
 
 def _splits(side: tuple[int, int], grid: tuple[int, int], overlap: int, alignment: int) -> Iterator[_Split]:

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
-from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.checks.pair import bounded_luminance
 from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
@@ -29,7 +28,7 @@ from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import RepairCounts, read_lrhs
-from oiio_msspl.image.arrays import Array, Mask, repair, unload
+from oiio_msspl.image.arrays import Array, Mask, blank, repair, unload
 from oiio_msspl.image.filters import grown, interpolate, means_around
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices, sample_cubic
@@ -74,14 +73,33 @@ class RenderPair:
         high = for_bands(alignment, lambda core, _: to_grid(alignment, self.read_hr_luminance(core), core))
         return bounded_luminance(lrhs), np.concatenate(high)
 
+    @cached_property
+    def hr_luminance(self) -> Array | None:
+        """Luminance (h, w) of the HRLS over its data window, finite and >= 0; None if its pixels are not in memory."""
+        if not isinstance(self.hr, Render):
+            return None
+        rgb = np.asarray(self.hr.layers[RGB])
+        result: Array = blank(rgb.shape[:2])
+
+        def work(rows: slice) -> None:
+            result[rows] = _luminance(rgb[rows])
+
+        for_row_blocks(work, len(rgb), rgb[0].size)
+        unload(result)
+        return result
+
     def read_hr_luminance(self, window: Window) -> Array:
         """Read the luminance (h, w) of the HRLS over a window that counts from the top left of the display window."""
-        return _luminance(read(self.hr, window, [RGB])[RGB])
+        if self.hr_luminance is None:
+            return _luminance(read(self.hr, window, [RGB])[RGB])
+        return np.asarray(self.hr_luminance[window.slices(self.alignment.hr_data_window)])
 
     def unload(self) -> None:
         """Give the memory of pixels that wait in temporary files back to the system."""
         self.lr.unload()
         self.hr.unload()
+        if self.hr_luminance is not None:
+            unload(self.hr_luminance)
 
 
 def shared_noise(frame: RenderPair, neighbour: RenderPair) -> float:
@@ -111,7 +129,7 @@ def lacking_passes(frame: RenderPair, neighbour: RenderPair) -> list[str]:
 
 
 def _passes(render: ReadableRender) -> set[str]:
-    names = render.features if isinstance(render, MappedRender) else getattr(render, "layers", ())
+    names = render.layers if isinstance(render, Render) else getattr(render, "features", ())
     return {name for name in names if is_light_of_pass(name)}
 
 
@@ -241,6 +259,8 @@ class _Nearest:
         #: Flat indices in the data window; these pixels begin at ``_first``.
         self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
         self._finite = _finite_pixels(pixels)
+        whole = neighbour.hr_luminance
+        self._luminance = np.ravel(_luminance(pixels[RGB]) if whole is None else whole[place.slices(window)])
 
     def finite(self) -> Mask:
         """Return where all features are finite, (h, w)."""
@@ -250,13 +270,7 @@ class _Nearest:
 
     def luminance(self) -> Array:
         """Return the luminance (h, w) of the beauty, finite and >= 0."""
-        result = np.empty(self._size, np.float32)
-
-        def work(rows: slice) -> None:
-            result[rows] = _luminance(self.pixels(RGB, rows.start, rows.stop))
-
-        for_row_blocks(work, self._size[0], 3 * self._size[1])
-        return result
+        return self._luminance.take(self._indices(0, self._size[0]), mode="wrap")
 
     def pixels(self, name: str, start: int, stop: int) -> Array:
         """Return a feature at some rows (n, w, c). Pixels that are not finite are 0."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -112,9 +113,8 @@ class MotionLayers:
     def channels(self, layer: str, components: tuple[str, str]) -> tuple[Channel, Channel] | None:
         """Return the channels of a vector that was found in another frame; None if this frame lacks them."""
         channels = self.layers[layer].channels if layer in self.layers else {}
-        if not all(c in channels for c in components):
-            return None
-        return channels[components[0]], channels[components[1]]
+        x, y = (channels.get(component) for component in components)
+        return (x, y) if x and y else None
 
 
 def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty) -> MotionLayers:
@@ -129,9 +129,8 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
     """
     named = {name: layer for name, layer in beauty.layers_of_view(layers) if name}
     common = renderers()[-1]
-    entries = [*renderer.get("motion", ()), *common["motion"]]
     vectors: dict[tuple[Channel, Channel], MotionField] = {}
-    for entry in entries:
+    for entry in [*renderer.get("motion", ()), *common["motion"]]:
         words = {key: value for key, value in entry.items() if key not in ("layer", "channels")}
         for vector in _fields(named, entry["layer"], entry.get("channels"), MotionFormat(**words)):
             vectors.setdefault(vector.channels, vector)
@@ -186,21 +185,18 @@ def read_format(text: str) -> list[dict[str, Any]]:
     Raises:
         InputError: the text can't be read.
     """
-    return [_words(part, text) for part in re.split(r"\+(?=layer=)", text.strip())]
-
-
-def _words(part: str, text: str) -> dict[str, Any]:
-    """Read the words of one layer's format."""
-    words: dict[str, Any] = {}
-    for word in part.split(","):
-        key, equals, value = (piece.strip() for piece in word.partition("="))
-        problem = f"{key} is given twice" if key in words else _problem_of_word(key, equals, value)
-        if problem:
-            raise InputError(f"--motion-format {text!r}: {problem}; an example is layer=velocity,to=next,y=up,scale=2")
-        words[key] = True if key == "premultiplied" else float(value) if key in ("scale", "offset") else value
-    if "layer" not in words:
-        raise InputError(f"--motion-format {text!r}: starts with layer=NAME")
-    return words
+    layers: list[dict[str, Any]] = []
+    for part in re.split(r"\+(?=layer=)", text.strip()):
+        layers.append(words := {})
+        for word in part.split(","):
+            key, equals, value = (piece.strip() for piece in word.partition("="))
+            if problem := f"{key} is given twice" if key in words else _problem_of_word(key, equals, value):
+                example = "an example is layer=velocity,to=next,y=up,scale=2"
+                raise InputError(f"--motion-format {text!r}: {problem}; {example}")
+            words[key] = True if key == "premultiplied" else float(value) if key in ("scale", "offset") else value
+        if "layer" not in words:
+            raise InputError(f"--motion-format {text!r}: starts with layer=NAME")
+    return layers
 
 
 def _problem_of_word(key: str, equals: str, value: str) -> str:
@@ -211,20 +207,15 @@ def _problem_of_word(key: str, equals: str, value: str) -> str:
     if key in CHOICES:
         return "" if value in CHOICES[key] else f"{key} is {' or '.join(CHOICES[key])}"
     if key in ("scale", "offset"):
-        good = _is_number(value) and (key, float(value)) != ("scale", 0)
-        return "" if good else f"{key} is a number" + (", but not 0" if key == "scale" else "")
+        with suppress(ValueError):
+            if math.isfinite(float(value)) and (key == "offset" or float(value)):
+                return ""
+        return f"{key} is a number" + (", but not 0" if key == "scale" else "")
     if key == "channels":
         return "" if len(value) == 2 else "channels are two letters, such as XY"
     if key == "premultiplied":
         return "premultiplied stands alone; leave it out if they are not" if equals else ""
     return "" if equals and value else f"write {key}=..."
-
-
-def _is_number(value: str) -> bool:
-    try:
-        return math.isfinite(float(value))
-    except ValueError:
-        return False
 
 
 def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:
@@ -239,10 +230,7 @@ def _fields(
     layers: Mapping[str, Layer], alias: str, components: Sequence[str] | None, form: MotionFormat
 ) -> Iterator[MotionField]:
     """Yield the vectors of the layer that an alias means: in these channels, or in the first usual ones."""
-    named = _named(layers, alias)
-    if named is None:
-        return
-    name, layer = named
+    name, layer = _named(layers, alias) or ("", Layer("", "", {}))
     for pair in [tuple(components)] if components else _PAIRS:
         channels = [layer.channels[c] for c in pair if c in layer.channels]
         if len(channels) == 2 and all(c.type != "uint" for c in channels) and channels[0].part == channels[1].part:

@@ -24,9 +24,9 @@ from oiio_msspl.jobs.plan import ViewPlan
 from oiio_msspl.jobs.timeline import Reach
 from oiio_msspl.model.session import Session
 
-#: Bytes of a pixel: a fused frame with alpha and the expected error; a vector, whether it is believed, whether an
-#: object has moved that it does not follow, and whether it is at a border; and the averaged frame.
-FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 20, 11, 20
+#: Bytes of a pixel: a fused frame with alpha and the expected error; a vector, whether it is believed, and
+#: whether an object has moved that it does not follow; and the averaged frame.
+FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 20, 10, 20
 #: Bytes that luminance takes for each frame that is held: of an LRHS pixel for both renders, and of an HRLS pixel.
 LUMINANCE_BYTES, HRLS_LUMINANCE_BYTES = 8, 4
 #: Bytes of a pixel for each channel of motion vectors that is read: as stored, decoded, and compared with zero.

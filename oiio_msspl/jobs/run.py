@@ -67,11 +67,7 @@ class ShotRun:
         self._wanted = {files.number: files for files in wanted}
         self._timeline = plan.timeline(wanted)
         self._frames: dict[Key, ShotFrame] = {}
-        self._motion = {
-            view: ShotMotion(own.motion, with_borders=own.reach.results > 0)
-            for view, own in plan.views.items()
-            if own.motion is not None
-        }
+        self._motion = {view: ShotMotion(own.motion) for view, own in plan.views.items() if own.motion is not None}
 
     @property
     def existing(self) -> ExistingResults:

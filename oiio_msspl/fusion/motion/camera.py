@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.fusion.motion.guides import TwoFrames
-from oiio_msspl.fusion.motion.vectors import sample_linear
+from oiio_msspl.fusion.motion.vectors import no_vectors, sample_linear
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.parallel import for_row_blocks
 
@@ -44,10 +44,6 @@ class Projection:
     depth: str = ""
     """How depth is measured, along the ``axis`` or the ``ray``; empty if frames have positions."""
 
-    def matrix(self, render: MappedRender) -> NDArray[np.float32] | None:
-        """Return the matrix of a frame, for row vectors; None if its header has none."""
-        return _matrix(render, self.attribute)
-
     def project(self, positions: Array, matrix: NDArray[np.float32]) -> Array:
         """Project positions (..., 3) to pixels of the frame, x and y (..., 2); NaN behind the camera."""
         seen = positions @ matrix[:3] + matrix[3]
@@ -62,7 +58,7 @@ def find_projection(frames: TwoFrames) -> Projection | None:
     Raises:
         InputError: pixels can't be decoded.
     """
-    if not any(key.lower() in MATRICES for key in frames.first.metadata):
+    if not _attributes(frames.first):
         return None
     return _by_position(frames.first) if frames.first.motion.position else _by_depth(frames)
 
@@ -79,12 +75,14 @@ def _by_position(render: MappedRender) -> Projection | None:
     chosen = np.linspace(0, len(x) - 1, min(len(x), SAMPLES)).astype(np.int64)
     points = positions[y[chosen], x[chosen]]
     pixels = np.stack([x[chosen] + window.x0, y[chosen] + window.y0], axis=-1).astype(np.float32)
-    for name in MATRICES:
-        for attribute in (key for key in render.metadata if key.lower() == name):
-            matrix = _matrix(render, attribute)
-            if matrix is not None and (projection := _fit(attribute, matrix, points, pixels)):
-                return projection
-    return None
+    matrices = ((attribute, _matrix(render, attribute)) for attribute in _attributes(render))
+    fits = (_fit(attribute, matrix, points, pixels) for attribute, matrix in matrices if matrix is not None)
+    return next(filter(None, fits), None)
+
+
+def _attributes(render: MappedRender) -> list[str]:
+    """Return the attributes of the header that may hold a matrix, the likeliest first."""
+    return [attribute for name in MATRICES for attribute in render.metadata if attribute.lower() == name]
 
 
 def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Projection) -> tuple[Array, Mask]:
@@ -94,9 +92,8 @@ def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Pr
         InputError: pixels can't be decoded.
     """
     window = render.data_window
-    vectors = np.zeros((window.height, window.width, 2), np.float32)
-    known = np.zeros(vectors.shape[:2], np.bool_)
-    here, there = projection.matrix(render), projection.matrix(neighbour)
+    vectors, known = no_vectors(render)
+    here, there = (_matrix(frame, projection.attribute) for frame in (render, neighbour))
     positions = _positions(render, projection)
     if here is None or there is None or positions is None:
         return vectors, known
@@ -116,8 +113,7 @@ def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Pr
     for_row_blocks(work, window.height, window.width * 12)
     # A lens that zooms changes the scale, which a matrix to the camera alone does not say.
     if not known.any() or np.median(distances[known]) > CLOSE:
-        known[:] = False
-        vectors[:] = 0
+        return no_vectors(render)
     return vectors, known
 
 
@@ -125,7 +121,7 @@ def _by_depth(frames: TwoFrames) -> Projection | None:
     """Find the matrix to the screen, and the kind of depth, that make the guides of both frames agree."""
     window = frames.first.display_window
     best, best_left = None, 1.0
-    for attribute in (key for key in frames.first.metadata if key.lower() in MATRICES):
+    for attribute in _attributes(frames.first):
         for (low, high), up, depth in itertools.product(((-1, 1), (0, 1)), (True, False), ("axis", "ray")):
             x, y = window.width / (high - low), window.height / (high - low)
             shift = (window.x0 - 0.5 - low * x, window.y0 - 0.5 + (high * y if up else -low * y))
@@ -162,7 +158,7 @@ def _positions(render: MappedRender, projection: Projection) -> Array | None:
     if not projection.depth:
         return render.file.read(render.motion.position, window) if render.motion.position else None
     attribute = next((key for key in render.metadata if key.lower() in ("worldtocamera", "nl")), "")
-    screen, camera = projection.matrix(render), _matrix(render, attribute)
+    screen, camera = _matrix(render, projection.attribute), _matrix(render, attribute)
     if screen is None or camera is None or render.motion.depth is None or np.linalg.matrix_rank(camera) < 4:
         return None
     depth = render.file.read([render.motion.depth], window)

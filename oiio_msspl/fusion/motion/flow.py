@@ -40,7 +40,9 @@ def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: W
 
     if min(frame.shape[:2]) < SMALLEST:
         return np.zeros((*frame.shape[:2], 2), np.float32), np.zeros(frame.shape[:2], np.bool_)
-    key = _mean_brightness(frame)
+    brightness = luminance(frame)
+    lit = brightness[np.isfinite(brightness) & (brightness > 0)]
+    key = float(np.exp(np.mean(np.log(lit)))) if lit.size else 1.0
     first, second = _eight_bit(frame, key), np.zeros(frame.shape[:2], np.uint8)
     shared = window.intersect(other_window)
     second[shared.slices(window)] = _eight_bit(neighbour, key)[shared.slices(other_window)]
@@ -56,13 +58,6 @@ def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: W
     known = inside & (np.hypot(trip[..., 0], trip[..., 1]) < FLOW_ERROR) & nearest_values(rendered, at_x, at_y)
     there[~known] = 0
     return there, known
-
-
-def _mean_brightness(image: Array) -> float:
-    """Return the geometric mean of the lit pixels."""
-    values = luminance(image)
-    lit = values[np.isfinite(values) & (values > 0)]
-    return float(np.exp(np.mean(np.log(lit)))) if lit.size else 1.0
 
 
 def _eight_bit(image: Array, key: float) -> NDArray[np.uint8]:

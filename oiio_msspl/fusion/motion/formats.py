@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from oiio_msspl.aovs.motion import CHOICES, MotionField, MotionFormat
 from oiio_msspl.fusion.motion.guides import POSITION, Guide, TwoFrames
 from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.image.arrays import Array, Mask
-from oiio_msspl.image.parallel import in_parallel
 
 #: The best format must fit this many times as well as no motion, and as the runner-up.
 MARGIN = 1.5
@@ -83,7 +81,11 @@ def check_field(
         verified: other frames of the shot have shown the expected format. Only one that fits clearly better is taken
             instead.
     """
-    checks = [_check_offset(frames, field, stored, offset, verified) for offset in _offsets(field, stored)]
+    offsets = [field.format.offset]
+    if "offset" not in field.fixed:  # vectors that are encoded as colours lie between 0 and 1
+        lowest, highest = (float(f([f(values) for values in stored])) for f in (np.min, np.max))
+        offsets = [0.0, 0.5] if lowest >= 0 and 0.25 < highest <= 1 else [0.0]
+    checks = [_check_offset(frames, field, stored, offset, verified) for offset in offsets]
     return min(checks, key=lambda check: (bool(check.problem), not check.zero, check.fit))
 
 
@@ -97,7 +99,7 @@ def _check_offset(
     if not frames.guides:
         return FieldCheck(field, "there is no albedo, world-space normal or position to verify it by")
     trial = _Trial(frames, stored, offset)
-    if not trial.usable:
+    if not trial.places:
         return FieldCheck(field, "albedo, normal and position are too even to verify it by")
     fits = trial.fits(_formats(field, encoded=offset != 0))
     best = min(fits, key=lambda form: fits[form])
@@ -120,13 +122,15 @@ def _check_offset(
     best = next(form for form in (field.format, best) if form == best or trial.is_same(form, best, fits))
     at_end = offset == 0 and "scale" not in field.fixed and not ANY_SCALES[0] < best.scale < ANY_SCALES[-1]
     if fits[best] * needed > 1 or at_end:
-        return FieldCheck(field, _no_format(frames, fits[best]), fit=fits[best])
+        names = ", ".join(guide.name for guide in frames.guides)
+        left = f"at best {fits[best]:.0%} of the differences are left"
+        return FieldCheck(field, f"no known format makes {names} of both frames agree ({left})", fit=fits[best])
     expected = replace(best, **{axis: getattr(field.format, axis) for axis in trial.silent(best)})
     fits[expected], best = fits[best], expected
     if verified and fits.get(field.format, np.inf) < MARGIN * max(fits[best], FLOOR):
         return FieldCheck(field, fit=fits[field.format], silent=trial.silent(field.format))
-    rivals = [f for f in fits if f.to == best.to and f != best and fits[f] < MARGIN**2 * max(fits[best], FLOOR)]
-    for rival in rivals:
+    limit = MARGIN**2 * max(fits[best], FLOOR)
+    for rival in (form for form in fits if form.to == best.to and form != best and fits[form] < limit):
         if not trial.beats(best, rival):
             return FieldCheck(field, f"'{best}' and '{rival}' fit it equally well")
     return FieldCheck(replace(field, format=best), fit=fits[best], silent=trial.silent(best))
@@ -135,10 +139,7 @@ def _check_offset(
 def _with_any_scale(
     trial: _Trial, field: MotionField, fits: dict[MotionFormat, float]
 ) -> tuple[MotionFormat, dict[MotionFormat, float]]:
-    """Find the best format of any scale. Return it, and how well it and the formats of ``fits`` fit.
-
-    Other formats of these scales are left out, because several neighbouring scales fit about as well.
-    """
+    """Find the best format of any scale. Return it, and how well it and the formats of ``fits`` fit."""
     units = (field.format.unit,) if "unit" in field.fixed else ANY_SCALES_OF
     formats = (form for form in _formats(field, encoded=False, scales=ANY_SCALES) if form.unit in units)
     every = trial.fits(formats)
@@ -151,19 +152,6 @@ def _with_any_scale(
     # Along one axis alone, units differ in nothing but their scales.
     same = (form for form in fits if form.unit == field.format.unit and trial.is_same(form, best, fits))
     return next(same, best), fits
-
-
-def _no_format(frames: TwoFrames, fit: float) -> str:
-    names = ", ".join(guide.name for guide in frames.guides)
-    return f"no known format makes {names} of both frames agree (at best {fit:.0%} of the differences are left)"
-
-
-def _offsets(field: MotionField, stored: tuple[Array, Array]) -> tuple[float, ...]:
-    """Return the stored values that may mean no motion. Vectors that are encoded as colours lie between 0 and 1."""
-    if "offset" in field.fixed:
-        return (field.format.offset,)
-    lowest, highest = (float(f([f(values) for values in stored])) for f in (np.min, np.max))
-    return (0.0, 0.5) if lowest >= 0 and 0.25 < highest <= 1 else (0.0,)
 
 
 def _moving(stored: Array, offset: float) -> Mask:
@@ -197,29 +185,19 @@ class _Place:
     frame: int
     x: Array
     y: Array
-    stored: Array
-    """(n, 2)"""
-    here: Array
-    """(n, c): the guide in this frame."""
-    still: Array
-    """(n): its difference to the other frame without motion."""
+    stored: Array  #: (n, 2)
+    here: Array  #: (n, c): the guide in this frame.
+    still: Array  #: (n): its difference to the other frame without motion.
 
 
 class _Trial:
     """Compares the guides of two frames as formats bring them to each other."""
 
     def __init__(self, frames: TwoFrames, stored: tuple[Array, Array], offset: float) -> None:
-        self._frame = (frames.first.display_window.width, frames.first.display_window.height)
+        self._size = (frames.first.display_window.width, frames.first.display_window.height)
         self._reduction = frames.reduction
-        self._places: list[_Place] = []
-        for guide in frames.guides:
-            places = in_parallel(*(partial(_place, guide, frame, stored[frame], offset) for frame in (0, 1)))
-            self._places += [place for place in places if place]
-
-    @property
-    def usable(self) -> bool:
-        """Whether there is anything to compare."""
-        return bool(self._places)
+        places = (_place(guide, frame, stored[frame], offset) for guide in frames.guides for frame in (0, 1))
+        self.places = [place for place in places if place]
 
     def fits(self, formats: Iterable[MotionFormat]) -> dict[MotionFormat, float]:
         """Return the share of the differences without motion that each format leaves.
@@ -227,7 +205,7 @@ class _Trial:
         It is the geometric mean over the guides that some format explains.
         """
         # 1 in a unit may be 2 in another one.
-        formats = {(f.to, f.offset, *f.pixels_per_unit(*self._frame)): f for f in reversed(list(formats))}.values()
+        formats = {(f.to, f.offset, *f.pixels_per_unit(*self._size)): f for f in reversed(list(formats))}.values()
         left = {form: {p.guide.name: self._left(p, form) for p in self._of(form)} for form in formats}
         names = {name for shares in left.values() for name in shares}
         if not names:
@@ -239,17 +217,13 @@ class _Trial:
         }
 
     def fit_scale(self, form: MotionFormat, fit: float, *, clearly: bool = True) -> float:
-        """Return a scale that fits better than that of a format, ``clearly`` or not; its own scale if there is none.
-
-        A shutter may have any length.
-        """
-        best, best_fit = form, fit
+        """Return a scale that fits better than that of a format, ``clearly`` or not; its own scale if there is none."""
+        best = form
         for width in (2.0, 2 ** (1 / 8), 2 ** (1 / 64)):
             scales = [best.scale * width ** (k / 8) for k in range(-8, 9)]
             fits = self.fits([replace(best, scale=float(f"{s:.4g}")) for s in scales] + [best])
             best = min(fits, key=lambda f: fits[f])
-            best_fit = fits[best]
-        return best.scale if best_fit * (MARGIN if clearly else 1) < fit else form.scale
+        return best.scale if fits[best] * (MARGIN if clearly else 1) < fit else form.scale
 
     def is_same(self, form: MotionFormat, other: MotionFormat, fits: dict[MotionFormat, float]) -> bool:
         """Return whether two formats say the same places in these frames."""
@@ -264,10 +238,7 @@ class _Trial:
         return frozenset(axis for axis, length in zip("xy", longest, strict=True) if is_silent(length))
 
     def beats(self, form: MotionFormat, rival: MotionFormat) -> bool:
-        """Return whether a format fits clearly better where the two say different places; True if they nowhere do.
-
-        In noise, the best format does not fit many times as well as another one. Then pixels vote (sign test).
-        """
+        """Return whether a format fits clearly better where the two say different places; True if they nowhere do."""
         votes = []
         for place in self._of(form):
             apart = self._apart(place, form, rival)
@@ -276,6 +247,7 @@ class _Trial:
             errors, of_rival = (self._errors(place, self._vectors(place, f)[apart], apart) for f in (form, rival))
             if _median(errors) * MARGIN < _median(of_rival):
                 return True
+            # In noise, the best format does not fit many times as well as another one. Then pixels vote (sign test).
             voters = np.isfinite(errors) & np.isfinite(of_rival)
             for_form = float(np.mean(errors[voters] < of_rival[voters])) if voters.any() else 0.5
             # Smoothing has correlated the noise over 9 pixels.
@@ -283,26 +255,21 @@ class _Trial:
         return not votes or float(np.sum(votes) / np.sqrt(len(votes))) > SURE
 
     def _of(self, form: MotionFormat) -> list[_Place]:
-        """Return the places where a format is tried: in the first frame if its vectors lead to the next one."""
-        return [place for place in self._places if place.frame == (0 if form.hop == 1 else 1)]
+        """Return the places of the frame whose vectors a format describes."""
+        return [place for place in self.places if place.frame == (0 if form.hop == 1 else 1)]
 
     def _vectors(self, place: _Place, form: MotionFormat) -> Array:
-        factors = np.array(form.pixels_per_unit(*self._frame), np.float32) / np.float32(self._reduction)
+        factors = np.array(form.pixels_per_unit(*self._size), np.float32) / np.float32(self._reduction)
         with np.errstate(over="ignore"):
-            vectors: Array = (place.stored - np.float32(form.offset)) * factors
-        return vectors
+            return np.asarray((place.stored - np.float32(form.offset)) * factors)
 
     def _apart(self, place: _Place, form: MotionFormat, other: MotionFormat) -> Mask:
         """Return where two formats say different places, (n)."""
         difference = self._vectors(place, form) - self._vectors(place, other)
-        apart: Mask = np.hypot(difference[:, 0], difference[:, 1]) * self._reduction > DIFFERENT
-        return apart
+        return np.asarray(np.hypot(*difference.T) * self._reduction > DIFFERENT)
 
     def _errors(self, place: _Place, vectors: Array, which: Mask | slice = slice(None)) -> Array:
-        """Return the differences (n) between this frame and the places of the other one; NaN outside.
-
-        ``vectors`` has one for each pixel that ``which`` chooses.
-        """
+        """Return the differences (n) to the other frame where vectors of ``which`` pixels lead; NaN outside."""
         other = place.guide.images[1 - place.frame]
         height, width = other.shape[:2]
         with np.errstate(invalid="ignore", over="ignore"):

@@ -21,9 +21,6 @@ from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.filters import box_downsample, sum_3x3
 from oiio_msspl.image.parallel import in_parallel
 
-#: Reads a window of a frame, (h, w, c).
-Reader = Callable[[Window], Array]
-
 POSITION = "position"
 #: Larger frames are averaged down to fewer pixels, which bounds memory.
 MAX_PIXELS = 1 << 22
@@ -123,20 +120,14 @@ def has_guide(render: MappedRender, name: str, *, moves: bool = True) -> bool:
     return formula is not None and not (moves and ("camera" in formula.note or "screen" in formula.note))
 
 
-def reduced(read: Reader, window: Window, reduction: int) -> Array:
+def reduced(read: Callable[[Window], Array], window: Window, reduction: int) -> Array:
     """Read a window in strips of rows and average it down. NaN and infinities become 0."""
-    height, width = window.height // reduction, window.width // reduction
-    result: Array | None = None
-    for y in range(0, height, ROWS):
-        rows = min(ROWS, height - y)
-        top = window.y0 + y * reduction
-        strip = read(Window(window.x0, top, window.x0 + width * reduction, top + rows * reduction))
-        strip = np.nan_to_num(strip, nan=0.0, posinf=0.0, neginf=0.0)
-        if result is None:
-            result = np.empty((height, width, strip.shape[-1]), np.float32)
-        result[y : y + rows] = box_downsample(strip, reduction) if reduction > 1 else strip
-    assert result is not None
-    return result
+    width, height = (size // reduction * reduction for size in (window.width, window.height))
+    strips = []
+    for part in Window(window.x0, window.y0, window.x0 + width, window.y0 + height).bands(ROWS * reduction):
+        strip = np.nan_to_num(read(part), nan=0.0, posinf=0.0, neginf=0.0)
+        strips.append(box_downsample(strip, reduction) if reduction > 1 else strip)
+    return np.concatenate(strips)
 
 
 def _steepness(image: Array) -> Array:

@@ -5,20 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import partial
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.motion.source import FLOW, STATIC, MotionFrame, MotionSource
-from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.image.arrays import Array, Mask, kept
-from oiio_msspl.image.parallel import in_parallel
 
 #: A vector and the way back may differ by this, in HRLS pixels: by rounding, and by what vectors change within a pixel.
 #: Vectors of optical flow are estimates, so more is allowed.
 ROUND_TRIP, ROUND_TRIP_OF_FLOW = 0.25, 1.0
-#: The vectors of two frames with more pixels are read one after the other, because decoding takes several times their
-#: memory.
-LARGEST_READ = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -32,8 +26,6 @@ class Motion:
     """(h, w): which vectors can be believed; None if all can."""
     moved_objects: Mask | None = None
     """(h, w): where an object has moved that the vectors do not follow. Such pixels are not ``known``."""
-    borders: Mask | None = None
-    """(h, w): :func:`near_borders` of the vectors; None if they are not computed yet."""
     tolerance: float = ROUND_TRIP
     """How far the way back may miss the pixel, in HRLS pixels."""
 
@@ -43,11 +35,10 @@ class ShotMotion:
 
     Args:
         source: how the motion is known.
-        with_borders: also keep the borders of surfaces, which the average of fused frames needs.
     """
 
-    def __init__(self, source: MotionSource, *, with_borders: bool) -> None:
-        self._source, self._with_borders = source, with_borders
+    def __init__(self, source: MotionSource) -> None:
+        self._source = source
         #: By the numbers of two frames: forwards and backwards; None if the vectors are 0 and can't be believed.
         self._motions: dict[tuple[int, int], tuple[Motion, Motion] | None] = {}
 
@@ -62,7 +53,7 @@ class ShotMotion:
         numbers = first.number, second.number
         if numbers not in self._motions:
             motions = self._read(first, second)
-            zero = any(motion.vectors is None and _any_known(motion) for motion in motions)
+            zero = any(m.vectors is None and (m.known is None or m.known.any()) for m in motions)
             self._motions[numbers] = None if zero and not self._source.zeros_are_right(first, second) else motions
         ways = self._motions[numbers]
         if ways is None:
@@ -76,37 +67,21 @@ class ShotMotion:
 
     def _read(self, first: MotionFrame, second: MotionFrame) -> tuple[Motion, Motion]:
         """Read the motion between two frames, forwards and backwards."""
-        source, window = self._source, first.hr.data_window
-        read, read_back = partial(source.read, first, second, 1), partial(source.read, second, first, -1)
-        stands = source.kind == STATIC and window == second.hr.data_window
-        if stands and not source.fields:
-            forth = back = read()
-        elif source.reads_one_frame and window.width * window.height <= LARGEST_READ:
-            forth, back = in_parallel(read, read_back)
-        else:
-            forth, back = read(), read_back()
-        moved = self._moved_objects(first, second, *forth)
-        # If the camera stands still, objects have moved at the same pixels of both frames.
-        same = stands and bool(forth[1].all() and back[1].all())
-        moved_back = moved if same or back is forth else self._moved_objects(second, first, *back)
-        motion = self._motion(*forth, moved)
-        return motion, motion if back is forth else self._motion(*back, moved_back)
+        source, forth = self._source, self._motion(first, second, 1)
+        # If nothing but objects moves, they have moved at the same pixels of both frames.
+        if source.kind == STATIC and not source.fields and first.hr.data_window == second.hr.data_window:
+            return forth, forth
+        return forth, self._motion(second, first, -1)
 
-    def _moved_objects(self, here: MotionFrame, there: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
-        """Find objects that have moved and that the vectors do not follow; None if there are none."""
+    def _motion(self, here: MotionFrame, there: MotionFrame, hop: int) -> Motion:
+        """Read the motion to a neighbour, and keep it as it waits for the frames that need it."""
+        vectors, known = self._source.read(here, there, hop)
         objects = self._source.moved_objects(here, there, vectors, known) if known.any() else None
-        return kept(objects) if objects is not None and objects.any() else None
-
-    def _motion(self, vectors: Array, known: Mask, moved_objects: Mask | None) -> Motion:
-        """Keep vectors as they wait for the frames that need them."""
-        tolerance = ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP
-        if moved_objects is not None:
-            known &= ~moved_objects
-        moves = vectors.any()
-        borders = kept(near_borders(vectors, tolerance)) if moves and self._with_borders else None
-        all_known = None if known.all() else kept(known)
-        return Motion(kept(vectors) if moves else None, all_known, moved_objects, borders, tolerance)
-
-
-def _any_known(motion: Motion) -> bool:
-    return motion.known is None or bool(motion.known.any())
+        if objects is not None:
+            known &= ~objects
+        return Motion(
+            kept(vectors) if vectors.any() else None,
+            None if known.all() else kept(known),
+            kept(objects) if objects is not None and objects.any() else None,
+            ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP,
+        )

@@ -30,7 +30,7 @@ from oiio_msspl.fusion.motion.flow import flow_vectors, has_optical_flow
 from oiio_msspl.fusion.motion.formats import FEWEST, MARGIN, FieldCheck, check_field, is_silent
 from oiio_msspl.fusion.motion.guides import TwoFrames, has_guide, open_frames, still_and_moved
 from oiio_msspl.fusion.motion.surfaces import other_surfaces
-from oiio_msspl.fusion.motion.vectors import channels_to_read, invert, judged_vectors
+from oiio_msspl.fusion.motion.vectors import invert, judged_vectors, no_vectors
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.parallel import in_parallel
 
@@ -54,7 +54,7 @@ class MotionFrame:
     pixels: ReadableRender | None = None
     """Features of the HRLS, if they are in memory, with albedo and normal where it has them."""
     number: int = 0
-    """Of the frame in its shot."""
+    """The frame number."""
     lr: MappedRender | None = None
     """The LRHS; only :func:`oiio_msspl.fusion.neighbours.hops.find_hops` needs it."""
 
@@ -79,30 +79,32 @@ class MotionSource:
         """Read where the surfaces of a frame are in a neighbour.
 
         Args:
-            frame: frame t.
-            neighbour: frame t + ``hop``.
+            frame, neighbour: frames t and t + ``hop``.
             hop: 1 or -1.
 
         Returns:
-            Vectors float32 (h, w, 2) over the data window of ``frame``: the surface that pixel (x, y) shows lies at
-            (x, y) + vector in the neighbour. In HRLS pixels, x to the right, y down, in coordinates of the display
-            window; the place may lie outside the neighbour. And a mask (h, w): where the vector can be believed. Other
-            vectors are 0. Unless the vectors were inverted, the mask does not know what hides a surface in the
-            neighbour.
+            Vectors float32 (h, w, 2) over the data window of ``frame``, in HRLS pixels, x to the right, y down: the
+            surface of pixel (x, y) lies at (x, y) + vector in the neighbour, or outside of it. And a mask (h, w): where
+            the vector can be believed. Other vectors are 0. Unless the vectors were inverted, the mask does not know
+            what hides a surface in the neighbour.
 
         Raises:
             InputError: pixels can't be decoded.
             ValueError: the source is optical flow, and a frame has no ``rgb``.
         """
         if self.kind == VECTORS:
-            return self._read_vectors(frame, neighbour, hop)
-        if self.kind == CAMERA and self.projection is not None:
+            if any(field.format.hop == hop for field in self.fields):
+                return self._vectors(frame, hop)
+            vectors, _ = self._vectors(frame, -hop)
+            back, known = self._vectors(neighbour, -hop)
+            return invert(vectors, back, known, frame.hr.data_window, neighbour.hr.data_window)
+        if self.projection:
             return camera_vectors(frame.hr, neighbour.hr, self.projection)
         if self.kind == FLOW:
             if frame.rgb is None or neighbour.rgb is None:
                 raise ValueError("optical flow needs the fused beauty of both frames")
             return flow_vectors(frame.rgb, neighbour.rgb, frame.hr.data_window, neighbour.hr.data_window)
-        vectors, known = _nothing(frame.hr)
+        vectors, known = no_vectors(frame.hr)
         if self.kind == STATIC:
             known[:] = True
             for field in self.fields:  # the camera may move elsewhere in the shot, by vectors that nobody has verified
@@ -127,9 +129,6 @@ class MotionSource:
     def moved_objects(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
         """Find where an object has moved that :meth:`read` does not follow, so that the frames show other surfaces.
 
-        Args:
-            vectors, known: what :meth:`read` returns.
-
         Returns:
             (h, w) over the data window of ``frame``. None if the source follows all objects.
 
@@ -141,7 +140,7 @@ class MotionSource:
         frames, moves = (frame, neighbour), self.kind == CAMERA
         names = [name for name in (ALBEDO, NORMAL) if all(has_guide(f.hr, name, moves=moves) for f in frames)]
         here, there = (f.pixels or f.hr for f in frames)
-        return other_surfaces(here, there, names, vectors if moves else None, known)
+        return other_surfaces(here, there, names, vectors, known)
 
     def tells_more(self, hr: MappedRender) -> bool:
         """Return whether something moves in a frame along an axis that is :attr:`silent`.
@@ -149,38 +148,29 @@ class MotionSource:
         Raises:
             InputError: pixels can't be decoded.
         """
-        channels = self.channels(hr)
-        if not channels:
-            return False
-        for vectors, known in self.vectors_of(hr, hr, hr.file.read(channels, hr.data_window)).values():
+        for vectors, known in self._read_stored(hr).values():
             for axis in self.silent:
                 lengths = np.sort(np.abs(vectors[..., "xy".index(axis)][known]))[-FEWEST:]
                 if len(lengths) == FEWEST and not is_silent(lengths[0]):
                     return True
         return False
 
-    @property
-    def reads_one_frame(self) -> bool:
-        """Whether :meth:`read` opens the file of ``frame`` alone, so that both ways can be read at the same time."""
-        return self.kind == VECTORS and {field.format.hop for field in self.fields} == {-1, 1}
-
     def channels(self, hr: MappedRender) -> list[Channel]:
         """Return the channels of a frame with its motion vectors, two for each layer and the alpha if there is one."""
-        return [channel for _, channels in self._stored_in(hr) for channel in channels_to_read(hr, channels)]
+        alpha = [hr.alpha] if hr.alpha else []
+        return [channel for _, channels in self._stored_in(hr) for channel in (*channels, *alpha)]
 
     def vectors_of(self, hr: MappedRender, pixels: ReadableRender, stored: Array) -> dict[int, tuple[Array, Mask]]:
         """Return the motion vectors of a frame, for :class:`MotionFrame`: by 1 to the next frame, -1 to the previous.
 
         Args:
-            hr: the frame.
-            pixels: its features.
+            hr, pixels: the frame and its features.
             stored: its :meth:`channels` (h, w, n).
         """
         layers = self._stored_in(hr)
-        parts = np.split(stored, len(layers), axis=-1) if layers else []
         return {
             field.format.hop: judged_vectors(hr, part, channels, field.format, pixels)
-            for (field, channels), part in zip(layers, parts, strict=True)
+            for (field, channels), part in zip(layers, np.split(stored, len(layers), axis=-1), strict=True)
         }
 
     def _stored_in(self, hr: MappedRender) -> list[tuple[MotionField, tuple[Channel, Channel]]]:
@@ -189,28 +179,16 @@ class MotionSource:
         layers = [(field, hr.motion.channels(field.layer, field.components)) for field in fields]
         return [(field, channels) for field, channels in layers if channels]
 
-    def _read_vectors(self, frame: MotionFrame, neighbour: MotionFrame, hop: int) -> tuple[Array, Mask]:
-        if any(field.format.hop == hop for field in self.fields):
-            return self._vectors(frame, hop)
-        own, _ = self._vectors(frame, -hop)
-        other, known = self._vectors(neighbour, -hop)
-        return invert(own, other, known, frame.hr.data_window, neighbour.hr.data_window)
-
     def _vectors(self, frame: MotionFrame, hop: int) -> tuple[Array, Mask]:
         """Return the vectors that a frame stores in one direction."""
         if hop in frame.vectors:
             return frame.vectors[hop]
-        hr = frame.hr
-        for field, channels in self._stored_in(hr):
-            if field.format.hop == hop:
-                stored = hr.file.read(channels_to_read(hr, channels), hr.data_window)
-                return judged_vectors(hr, stored, channels, field.format, hr)
-        return _nothing(hr)
+        one_way = replace(self, fields=tuple(field for field in self.fields if field.format.hop == hop))
+        return one_way._read_stored(frame.hr).get(hop) or no_vectors(frame.hr)
 
-
-def _nothing(render: MappedRender) -> tuple[Array, Mask]:
-    size = render.data_window.height, render.data_window.width
-    return np.zeros((*size, 2), np.float32), np.zeros(size, np.bool_)
+    def _read_stored(self, hr: MappedRender) -> dict[int, tuple[Array, Mask]]:
+        channels = self.channels(hr)
+        return self.vectors_of(hr, hr, hr.file.read(channels, hr.data_window)) if channels else {}
 
 
 def find_motion(
@@ -247,12 +225,10 @@ def _find(
         return MotionSource(NONE, f"its data window and that of {second.name} have no common part")
     fields = first.motion.fields if wanted is None else user_fields(first.motion, wanted, first.name)
     stored = in_parallel(*(partial(_stored, frames, index, fields) for index in (0, 1)))
-    checks = []
-    for field in fields:
-        known = verified.get(field.name)
-        field = replace(field, format=known.format) if known else field
-        vectors = stored[0].get(field.name), stored[1].get(field.name)
-        checks.append(_check(frames, field, vectors, verified=known is not None))
+    checks = [
+        _check(frames, field, stored[0].get(field.name), stored[1].get(field.name), verified.get(field.name))
+        for field in fields
+    ]
     # To the next frame, and to the previous one.
     each_way = {check.field.format.hop: check for check in reversed(checks) if not check.problem}
     if each_way:
@@ -264,19 +240,16 @@ def _find(
 
 
 def _check(
-    frames: TwoFrames, field: MotionField, stored: tuple[Array | None, Array | None], *, verified: bool
+    frames: TwoFrames, field: MotionField, first: Array | None, second: Array | None, verified: MotionField | None
 ) -> FieldCheck:
-    """Verify a layer, or believe the user who has described it completely, unless the pixels contradict.
-
-    ``stored`` are its vectors in both frames, see :func:`_stored`.
-    """
-    if stored[0] is None or stored[1] is None:
+    """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
+    field = replace(field, format=verified.format) if verified else field
+    if first is None or second is None:
         return FieldCheck(field, f"{frames.second.name} lacks it")
-    vectors = stored[0], stored[1]
-    check = check_field(frames, field, vectors, verified=verified)
+    check = check_field(frames, field, (first, second), verified=verified is not None)
     if check.zero or not {"to", "x", "y", "unit"} <= field.fixed:
         return check
-    other = check_field(frames, replace(field, fixed=frozenset({"to"})), vectors)
+    other = check_field(frames, replace(field, fixed=frozenset({"to"})), (first, second))
     if not other.problem and other.fit * MARGIN < check.fit:
         fits = f"'{other.field.format}' explains {1 - other.fit:.0%} of what changes"
         return replace(check, problem=f"{fits}, and this {max(1 - check.fit, 0):.0%}")

@@ -28,14 +28,14 @@ PIXELS_AT_ONCE = 1 << 22
 
 
 def other_surfaces(
-    here: ReadableRender, there: ReadableRender, names: Sequence[str], vectors: Array | None, known: Mask
+    here: ReadableRender, there: ReadableRender, names: Sequence[str], vectors: Array, known: Mask
 ) -> Mask:
     """Find the pixels (h, w) of a frame where its neighbour shows another surface, and those beside them.
 
     Args:
         here, there: the frame and its neighbour.
         names: layers of both frames that have no light, such as the albedo. Without any, no surface is another one.
-        vectors: to the places of the surfaces in the neighbour, (h, w, 2) in HRLS pixels; None if they stay.
+        vectors: to the places of the surfaces in the neighbour, (h, w, 2) in HRLS pixels.
         known: which vectors can be believed, (h, w). Other pixels are not compared.
 
     Raises:
@@ -48,13 +48,9 @@ def other_surfaces(
         last = min(top + rows, height)
         around = slice(max(top - REACH, 0), min(last + REACH, height))
         area = Window(window.x0, window.y0 + around.start, window.x1, window.y0 + around.stop)
-        if vectors is None and window == there.data_window:
-            layers, compared = _layers(there, names, area), known[around]
-        else:
-            way = np.zeros((area.height, area.width, 2), np.float32) if vectors is None else vectors[around]
-            layers, compared = _at_places(there, names, area, way, known[around])
-        other = _differ(_layers(here, names, area), layers, compared)
-        result[top:last] = other[top - around.start :][: last - top]
+        layers, compared = _at_places(there, names, area, vectors[around], known[around])
+        differs = _differ(_layers(here, names, area), layers, compared)
+        result[top:last] = differs[top - around.start :][: last - top]
         for render in (here, there):
             render.unload()
     return result
@@ -92,9 +88,7 @@ def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Ma
         other = np.zeros((around.stop - around.start, width), np.bool_)
         for one, two in zip(here, there, strict=True):
             one, two = _planes(one[around]), _planes(two[around])
-            limit = np.maximum(_roughness(one), _roughness(two))
-            limit *= np.float32(MULTIPLE)
-            limit += np.float32(DIFFERENCE)
+            limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + np.float32(DIFFERENCE)
             differs = (_distance(one, two) > limit) & compared[around]
             other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
         result[rows] = grown(other)[first - around.start :][: last - first]
@@ -106,16 +100,13 @@ def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Ma
 def _planes(image: Array) -> Array:
     """Return (h, w, c) as (c, h, w). NaN and infinities become 0."""
     planes = np.moveaxis(image, -1, 0).copy(order="C")
-    if not np.isfinite([planes.min(), planes.max()]).all():
-        planes[~np.isfinite(planes)] = 0
+    planes[~np.isfinite(planes)] = 0
     return planes
 
 
 def _roughness(planes: Array) -> Array:
-    """Return the usual difference of neighbouring pixels of one surface, mean of 3 x 3 pixels (h, w).
-
-    Of two neighbours on opposite sides, at least one lies on the surface of the pixel.
-    """
+    """Return the usual difference of neighbouring pixels of one surface, mean of 3 x 3 pixels (h, w)."""
+    # Of two neighbours on opposite sides, at least one lies on the surface of the pixel.
     total = np.zeros(planes.shape[1:], np.float32)
     for changes, sums in (
         (_distance(planes[:, 1:], planes[:, :-1]), total),
@@ -125,16 +116,10 @@ def _roughness(planes: Array) -> Array:
             sums[1:-1] += np.minimum(changes[1:], changes[:-1])
             sums[0] += changes[0]
             sums[-1] += changes[-1]
-    result = sum_3x3(total)
-    result /= 9
-    return result
+    return sum_3x3(total) / np.float32(9)
 
 
 def _distance(one: Array, two: Array) -> Array:
     """Return the length (h, w) of the difference of planes (c, h, w)."""
-    total = np.zeros(one.shape[1:], np.float32)
-    for a, b in zip(one, two, strict=True):
-        difference = a - b
-        difference *= difference
-        total += difference
-    return np.sqrt(total, out=total)
+    squares: Array = sum(np.square(a - b) for a, b in zip(one, two, strict=True))
+    return np.sqrt(squares)

@@ -7,8 +7,6 @@ surface in another frame. Pixels count in the display window, so frames may have
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,9 +29,10 @@ UNEVEN = 0.25
 INVERSION_ROUNDS, INVERSION_ERROR = 3, 0.5
 
 
-def channels_to_read(render: MappedRender, channels: tuple[Channel, Channel]) -> list[Channel]:
-    """Return the channels that :func:`judged_vectors` needs: two with vectors, and the alpha if there is one."""
-    return [*channels, *([render.alpha] if render.alpha else [])]
+def no_vectors(render: MappedRender) -> tuple[Array, Mask]:
+    """Return vectors (h, w, 2) over a data window that are all 0 and can't be believed, and where they can (h, w)."""
+    size = render.data_window.height, render.data_window.width
+    return np.zeros((*size, 2), np.float32), np.zeros(size, np.bool_)
 
 
 def judged_vectors(
@@ -43,7 +42,7 @@ def judged_vectors(
 
     Args:
         render: the frame.
-        stored: :func:`channels_to_read` over its data window, (h, w, 2 or 3).
+        stored: these channels over its data window, and its alpha if it has one, (h, w, 2 or 3).
         channels: the two that hold the vectors.
         form: how they are stored.
         pixels: the frame's features.
@@ -104,27 +103,20 @@ def decode(
 
 
 def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask:
-    """Find where a vector of 0 may mean that the renderer knows none.
-
-    Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of the
-    surfaces do not move either.
-    """
-    still = known & _all_planes(np.abs(vectors) < NO_MOTION)
-    surface = known
+    """Find where a vector of 0 may mean that the renderer knows none."""
+    # Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of
+    # the surfaces do not move either.
+    still = known & (np.abs(vectors) < NO_MOTION).all(axis=-1)
     normal = pixels.read(pixels.data_window, [NORMAL]).get(NORMAL) if still.any() else None
-    if normal is not None:
-        surface = known & ~_all_planes(normal == 0)
+    surface = known if normal is None else known & (normal != 0).any(axis=-1)
     count = np.count_nonzero(surface)
     camera_stands = count > 0 and np.count_nonzero(still & surface) * 2 >= count
     return np.zeros_like(known) if camera_stands else still
 
 
 def _uneven(vectors: Array) -> Mask:
-    """Find where vectors change by more than ``UNEVEN`` on both sides of a pixel, in one direction: things turn fast.
-
-    At the border of two surfaces, vectors change on one side. On a surface as thin as a pixel, they change and change
-    back.
-    """
+    """Find where vectors change by more than ``UNEVEN`` on both sides of a pixel, in one direction: turning things."""
+    # At the border of two surfaces, vectors change on one side. On one as thin as a pixel, they change and change back.
     motion = as_complex(vectors)
     result = np.zeros(motion.shape, np.bool_)
     for turned, uneven in ((motion, result), (motion.T, result.T)):
@@ -135,11 +127,6 @@ def _uneven(vectors: Array) -> Mask:
     return result
 
 
-def _all_planes(mask: Mask) -> Mask:
-    """Return where a mask (h, w, c) is true in all channels, several times as fast as ``all`` along the last axis."""
-    return functools.reduce(np.logical_and, np.moveaxis(mask, -1, 0))
-
-
 def invert(own: Array, other: Array, other_known: Mask, window: Window, other_window: Window) -> tuple[Array, Mask]:
     """Compute the vectors to a neighbour from those that lead from the neighbour to this frame.
 
@@ -147,8 +134,8 @@ def invert(own: Array, other: Array, other_known: Mask, window: Window, other_wi
     finds it (Chen et al. 2008, "A simple fixed-point approach to invert a deformation field").
 
     Args:
-        own: this frame's vectors to its other neighbour (h, w, 2): where the movement is even, their opposite is right,
-            so the iteration starts there. Zeros do, too.
+        own: this frame's vectors to its other neighbour (h, w, 2). The iteration starts at their opposite, which is
+            right where the movement is even.
         other, other_known: vectors of the neighbour, and where they are known.
         window, other_window: data windows of this frame and of the neighbour.
 
@@ -202,9 +189,7 @@ def as_complex(vectors: Array) -> NDArray[np.complex64]:
 def sample_linear(image: Array, x: Array, y: Array) -> Array:
     """Interpolate an image (h, w, c) linearly at pixel positions; its edge is repeated outside."""
     height, width, channels = image.shape
-    # Two floats are fetched as one complex number, which takes half as long.
     pixels = np.ascontiguousarray(image).reshape(-1, channels)
-    pixels = pixels.view(np.complex64) if channels == 2 else pixels
     x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
     left, top = x.astype(np.int32), y.astype(np.int32)
     u, v = (x - left)[..., None], (y - top)[..., None]
@@ -216,8 +201,7 @@ def sample_linear(image: Array, x: Array, y: Array) -> Array:
     below = pixels.take(corner, 0)
     below += (pixels.take(corner + right, 0) - below) * u
     result += (below - result) * v
-    samples: Array = result.view(np.float32)
-    return samples
+    return result
 
 
 def nearest_values(image: NDArray[np.bool_], x: Array, y: Array) -> Mask:

@@ -31,7 +31,6 @@ from oiio_msspl.image.colour import luminance
 #: Bytes for each pixel of the rows that are averaged at a time: of renders without their features, and of results.
 BYTES_OF_RENDERS, BYTES_OF_RESULTS = 44, 96
 
-
 F = TypeVar("F", RenderPair, FusedFrame)
 C = TypeVar("C", RenderPair, FusedFrame, contravariant=True)
 
@@ -40,13 +39,7 @@ class Band(Protocol[C]):
     """Some rows of a frame, to which those of neighbours are added: :class:`RenderBand` or :class:`ResultBand`."""
 
     def add(self, hop: Hop[C], path: Path, judge: Judge) -> None:
-        """Add a neighbour.
-
-        Args:
-            hop: the last one to it.
-            path: leads from the frame to it.
-            judge: says how much it counts by its light, see :meth:`Light.judge`; called once.
-        """
+        """Add the neighbour that a path leads to by its last hop. Call ``judge`` once."""
 
     def finish(self) -> Array:
         """Turn the sums into means. Return the number of frames (h, w, 1), see :meth:`WeightedSum.divide`."""
@@ -64,8 +57,7 @@ def average_renders(
 
     Args:
         pair: the frame.
-        before: hops to the frame before it, to the one before that, and so on. All have the features of the frame.
-        after: hops to the frames after it, the nearest first.
+        before, after: hops to the frames before and after it, the nearest first. All have the features of the frame.
         features: which features the result has, if the renders have them; all if None.
 
     Returns:
@@ -97,8 +89,7 @@ def average_results(
 
     Args:
         frame: the frame.
-        before: hops to the frame before it, to the one before that, and so on.
-        after: hops to the frames after it, the nearest first.
+        before, after: hops to the frames before and after it, the nearest first.
 
     Returns:
         The frame with averaged colour and alpha, and with its number of frames.
@@ -127,14 +118,7 @@ def _average(
     band_of: Callable[[Window, Window], Band[F]],
     weight: float = 1.0,
 ) -> Array:
-    """Average a frame with its neighbours, band by band, and return the number of frames (h, w, 1).
-
-    Args:
-        alignment, light: of the frame.
-        before, after: hops to its neighbours, the nearest first.
-        band_of: makes the strategy for a band, see :func:`for_bands`.
-        weight: memory of a pixel, see there.
-    """
+    """Average a frame with its neighbours, band by band, and return the number of frames (h, w, 1)."""
     window = alignment.hr_data_window
     frames: Array = blank((window.height, window.width, 1))
 
@@ -164,11 +148,7 @@ def memory_to_average_renders(window: Window, channels: int) -> int:
 
 
 def memory_to_average_results(window: Window) -> int:
-    """Return the bytes that :func:`average_results` needs beside its arguments and its result.
-
-    Args:
-        window: the HRLS's data window.
-    """
+    """Return the bytes that :func:`average_results` needs beside its arguments and its result, by the data window."""
     return rows_in_bands(window) * window.width * BYTES_OF_RESULTS
 
 

@@ -63,11 +63,6 @@ def grid_window(alignment: Alignment, area: Window) -> Window:
     return Window(grid.x0, area.y0 // scale, grid.x1, -(-area.y1 // scale))
 
 
-def grid_rows(alignment: Alignment, area: Window) -> slice:
-    """Return the rows of the grid that cover an area."""
-    return grid_window(alignment, area).slices(alignment.grid)[0]
-
-
 def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
     """Average a plane (h, w) over ``area`` to the LRHS's resolution, over :func:`grid_window`."""
     whole = _whole_pixels(alignment, area)

@@ -33,15 +33,11 @@ def find_hops(
 
     Args:
         motion: between the frames.
-        number: of the frame.
-        neighbours: their numbers, the nearest first.
+        number, neighbours: the frame's number and those of its neighbours, the nearest first.
         frame_of: returns a frame, and its renders or fused picture. If it raises an InputError, the hops end with a
             warning, because the files are the reason, in every run. Any other error is passed on: it may not occur
             again, and the pixels would depend on it.
         warnings: gets a sentence for each problem.
-
-    Raises:
-        Exception: what ``frame_of`` raises.
     """
     hops: list[Hop[F]] = []
     own, picture = frame_of(number)
@@ -50,18 +46,20 @@ def find_hops(
         try:
             neighbour, neighbour_picture = frame_of(other)
             _check_alike(own, picture, neighbour, neighbour_picture)
-            if nearer is own and _have_one_noise(picture, neighbour_picture):
-                warnings.append(f"frames {min(number, other)} and {max(number, other)} {SAME_SEED}")
+            lacking: list[str] = []
+            if isinstance(picture, RenderPair) and isinstance(neighbour_picture, RenderPair):
+                if nearer is own and shared_noise(picture, neighbour_picture) > SAME_NOISE:
+                    warnings.append(f"frames {min(number, other)} and {max(number, other)} {SAME_SEED}")
+                lacking = lacking_passes(picture, neighbour_picture)
             there, back = motion.between(nearer, neighbour)
         except InputError as error:
             warnings.append(f"frame {other} is not averaged: {error}")
             break
         hops.append(Hop(neighbour_picture, there, back))
         nearer = neighbour
-        if isinstance(picture, RenderPair) and isinstance(neighbour_picture, RenderPair):
-            names = " and ".join(lacking_passes(picture, neighbour_picture))
-            if names:
-                warnings.append(f"frame {other} has no set of passes with {names}, so passes are not averaged")
+        if lacking:
+            names = " and ".join(lacking)
+            warnings.append(f"frame {other} has no set of passes with {names}, so passes are not averaged")
     return hops
 
 
@@ -83,10 +81,3 @@ def _check_alike(frame: MotionFrame, picture: F, neighbour: MotionFrame, neighbo
 
 def _features(render: MappedRender | None) -> set[str]:
     return set() if render is None else {*render.features, *(["alpha"] if render.alpha else [])}
-
-
-def _have_one_noise(picture: F, neighbour: F) -> bool:
-    """Return whether both are renders that have the same noise."""
-    if not isinstance(picture, RenderPair) or not isinstance(neighbour, RenderPair):
-        return False
-    return shared_noise(picture, neighbour) > SAME_NOISE

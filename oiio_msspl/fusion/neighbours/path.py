@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -54,15 +54,9 @@ class Path:
         self.moved_objects: Mask | None = None
 
     def follow(self, there: Motion, back: Motion, window: Window) -> None:
-        """Go on to the next frame.
-
-        Args:
-            there, back: the motion to it, and the way back.
-            window: its data window.
-        """
+        """Go on to the next frame, whose data window is ``window``, by the motion to it and the way back."""
         vectors, vectors_back = (None if way.vectors is None else as_complex(way.vectors) for way in (there, back))
         valid, shape = self.valid.copy(), self.valid.shape
-        moved = None if there.moved_objects is None else np.empty(shape, np.bool_)
         places: tuple[Array, Array, NDArray[np.intp]] | None = None
         if vectors is not None or window != self._end:
             places = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.intp)
@@ -72,10 +66,13 @@ class Path:
             good = valid[rows]
             if there.known is not None:
                 good &= self._values(there.known, rows, start)
-            if moved is not None and there.moved_objects is not None:
-                moved[rows] = self._values(there.moved_objects, rows, start)
             vector = None if vectors is None else self._values(vectors, rows, start)
-            x, y = self._arrive(rows, vector, window, good)
+            from_x, from_y = self.positions(rows)
+            x, y = (from_x, from_y) if vector is None else (from_x + vector.real, from_y + vector.imag)
+            # False for NaN, too. Pixels that leave the window stay where they are.
+            good &= (x > window.x0 - 0.5) & (x < window.x1 - 0.5) & (y > window.y0 - 0.5) & (y < window.y1 - 0.5)
+            if vector is not None and not good.all():
+                x[~good], y[~good] = from_x[~good], from_y[~good]
             if places is not None:
                 end = nearest_indices(x - window.x0, y - window.y0, (window.height, window.width))
                 places[0][rows], places[1][rows], places[2][rows] = x, y, end
@@ -88,40 +85,28 @@ class Path:
                 good &= np.square(miss.real) + np.square(miss.imag) < there.tolerance**2  # false for NaN, too
 
         for_row_blocks(work, *shape)
+        if there.moved_objects is not None:
+            moved = self._values(there.moved_objects, slice(0, shape[0]), self.nearest)
+            self.moved_objects = moved if self.moved_objects is None else self.moved_objects | moved
         if places is not None:
             self.x, self.y, self.nearest = places
-        if moved is not None:
-            self.moved_objects = moved if self.moved_objects is None else self.moved_objects | moved
         self.valid, self._end = valid, window
         self.hops += 1
-
-    def _arrive(
-        self, rows: slice, vector: NDArray[np.complex64] | None, window: Window, good: Mask
-    ) -> tuple[Array, Array]:
-        """Return where vectors lead. Pixels that leave the window are not ``good`` any more and stay where they are."""
-        from_x, from_y = self.positions(rows)
-        x, y = (from_x, from_y) if vector is None else (from_x + vector.real, from_y + vector.imag)
-        # False for NaN, too.
-        good &= (x > window.x0 - 0.5) & (x < window.x1 - 0.5) & (y > window.y0 - 0.5) & (y < window.y1 - 0.5)
-        if vector is not None and not good.all():
-            bad = ~good
-            x[bad], y[bad] = from_x[bad], from_y[bad]
-        return x, y
 
     def _values(self, values: NDArray[Any], rows: slice, indices: NDArray[np.intp] | None) -> NDArray[Any]:
         """Return values over a data window at flat indices; at these rows of the area if there are none."""
         if indices is not None:
             return values.reshape(-1).take(indices, mode="clip")  # a check of all indices takes as long as to take them
-        area = self._area
-        part = Window(area.x0, area.y0 + rows.start, area.x1, area.y0 + rows.stop)
-        return np.asarray(values[part.slices(self._start)])
+        return np.asarray(values[self._rows(rows).slices(self._start)])
 
     def positions(self, rows: slice) -> tuple[Array, Array]:
         """Return the positions of some rows, x and y, (n, w) each."""
         if self.x is not None and self.y is not None:
             return self.x[rows], self.y[rows]
-        area = self._area
-        return pixel_positions(Window(area.x0, area.y0 + rows.start, area.x1, area.y0 + rows.stop))
+        return pixel_positions(self._rows(rows))
+
+    def _rows(self, rows: slice) -> Window:
+        return replace(self._area, y0=self._area.y0 + rows.start, y1=self._area.y0 + rows.stop)
 
     def place_in(self, window: Window) -> Window:
         """Return the rows of a window around the positions that cubic interpolation reads."""

@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
-from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.checks.pair import bounded_luminance
-from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_rows, grid_window, to_grid
+from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
-from oiio_msspl.fusion.neighbours.trust import Judge, Light, relative_difference
+from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import RepairCounts, read_lrhs
@@ -41,7 +40,7 @@ COVERED = 0.9
 NEAR_OBJECTS, FEW = 8, 0.125
 #: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided
 #: by the root of the product. That is a factor of 5.
-OTHER_BRIGHTNESS = np.float32(4 / np.sqrt(5))
+OTHER_BRIGHTNESS = 4 / 5**0.5
 #: There, a neighbour counts less by this, too. It lacks some pixels, so the noise changes from pixel to pixel, and the
 #: network takes single noisy pixels for detail.
 BESIDE_HIDDEN = np.float32(0.7)
@@ -93,12 +92,7 @@ class RenderPair:
         """Read the luminance (h, w) of the HRLS over a window that counts from the top left of the display window."""
         if self.hr_luminance is None:
             return _luminance(read(self.hr, window, [RGB])[RGB])
-        return np.asarray(self.hr_luminance)[window.slices(self.alignment.hr_data_window)]
-
-    @cached_property
-    def hr_is_finite(self) -> bool:
-        """Whether the HRLS is in memory and all its pixels are finite."""
-        return isinstance(self.hr, Render) and _finite_pixels(self.hr.layers) is None
+        return np.asarray(self.hr_luminance[window.slices(self.alignment.hr_data_window)])
 
     def unload(self) -> None:
         """Give the memory of pixels that wait in temporary files back to the system."""
@@ -130,23 +124,20 @@ def shared_noise(frame: RenderPair, neighbour: RenderPair) -> float:
 def lacking_passes(frame: RenderPair, neighbour: RenderPair) -> list[str]:
     """Return the names of the passes that a frame's renders have and those of a neighbour lack."""
     renders = (frame.lr, neighbour.lr), (frame.hr, neighbour.hr)
-    lacking = {name for own, other in renders for name in feature_names(own) - feature_names(other)}
-    return sorted(name.removeprefix(LIGHT_OF) for name in lacking if is_light_of_pass(name))
+    lacking = {name for own, other in renders for name in _passes(own) - _passes(other)}
+    return sorted(name.removeprefix(LIGHT_OF) for name in lacking)
 
 
-def feature_names(render: ReadableRender) -> set[str]:
-    """Return the features of a render in memory, or of a file whose layers are mapped."""
-    if isinstance(render, Render):
-        return set(render.layers)
-    return set(render.features) if isinstance(render, MappedRender) else set()
+def _passes(render: ReadableRender) -> set[str]:
+    names = render.layers if isinstance(render, Render) else getattr(render, "features", ())
+    return {name for name in names if is_light_of_pass(name)}
 
 
 class RenderBand:
     """Some rows of both renders, to which those of neighbours are added.
 
     Args:
-        pair: the frame.
-        light: its light.
+        pair, light: the frame and its light.
         low: the LRHS's features over its data window; the rows of ``core`` are changed.
         high: gets the HRLS's features over the rows of ``core`` of its data window.
         core, area: see :func:`oiio_msspl.fusion.neighbours.bands.for_bands`.
@@ -156,18 +147,17 @@ class RenderBand:
         self, pair: RenderPair, light: Light, low: Features, high: Features, core: Window, area: Window
     ) -> None:
         self._pair, self._light, self._area = pair, light, area
-        self._features, self._low_features = list(high), list(low)
+        self._names, self._low_names = list(high), list(low)
         self._alignment = alignment = pair.alignment
         self._luminance = pair.read_hr_luminance(area)
-        self._low_luminance = pair.luminances[0][grid_rows(alignment, area)]
-        #: The rows of ``core`` in the area.
         self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
         self._high_images = {name: image[core.slices(alignment.hr_data_window)] for name, image in high.items()}
-        for name, values in read(pair.hr, core, self._features).items():
+        for name, values in read(pair.hr, core, self._names).items():
             self._high_images[name][:] = values
         self._high = WeightedSum(self._high_images)
         #: The grid pixels of the area, and those of ``core`` that the LRHS has: it may lack a row or a column.
         self._grid = grid_window(alignment, area)
+        self._low_luminance = pair.luminances[0][self._grid.slices(alignment.grid)]
         self._low_place = grid_window(alignment, core).intersect(alignment.lr_data_window)
         inside = self._low_place.slices(alignment.lr_data_window)
         self._low = WeightedSum({name: image[inside] for name, image in low.items()})
@@ -175,7 +165,7 @@ class RenderBand:
     def add(self, hop: Hop[RenderPair], path: Path, judge: Judge) -> None:
         """Add the renders of a neighbour that a path leads to."""
         neighbour, alignment, area = hop.frame, self._alignment, self._area
-        high = _Nearest(neighbour, path, self._features)
+        high = _Nearest(neighbour, path, self._names)
         valid = high.finite() & path.valid
         share = to_grid(alignment, valid.astype(np.float32), area)
         low, usable = self._fetch_low(neighbour, path, valid, share)
@@ -185,17 +175,17 @@ class RenderBand:
         counted = judge(lrhs, hrls)
         if path.moved_objects is not None:
             counted = counted * self._far_from(path.moved_objects)
-        hidden = grown(share < 1, 2)
-        counted = counted * np.where(hidden, BESIDE_HIDDEN * self._as_bright(lrhs), np.float32(1))
+        bright = likeness(self._low_luminance, lrhs, self._light.darkest, OTHER_BRIGHTNESS, steep=True)
+        counted = counted * np.where(grown(share < 1, 2), BESIDE_HIDDEN * bright, np.float32(1))
         weight = from_grid(alignment, counted, area) * valid
-        first = self._rows.start
-        self._high.add(lambda name, rows: high.pixels(name, first + rows.start, first + rows.stop), weight[self._rows])
+        top = self._rows.start
+        self._high.add(lambda name, rows: high.pixels(name, top + rows.start, top + rows.stop), weight[self._rows])
         place = self._low_place.slices(self._grid)
         self._low.add(lambda name, rows: low[name][place][rows], (counted * usable)[place])
         neighbour.unload()
 
     def finish(self) -> Array:
-        """Turn the sums into means. Return the number of frames, see :meth:`WeightedSum.divide`."""
+        """Turn the sums into means, and return the number of frames."""
         self._low.divide()
         frames = self._high.divide()
         for image in self._high_images.values():
@@ -204,10 +194,7 @@ class RenderBand:
         return frames
 
     def _in_grid(self, lrhs: Array, usable: Mask, stretch: tuple[float, float]) -> Array:
-        """Bring the luminance (h, w) of a neighbour's LRHS to the places of the grid pixels.
-
-        Where it is not ``usable``, take the frame's own. ``stretch`` is :attr:`Alignment.stretch` of the neighbour.
-        """
+        """Bring the luminance (h, w) of an LRHS to the grid pixels; where it is not usable, take the frame's own."""
         if stretch != (1.0, 1.0):
             grid = self._grid
             columns, rows = (
@@ -221,27 +208,13 @@ class RenderBand:
         return np.where(usable, lrhs, self._low_luminance)
 
     def _far_from(self, moved_objects: Mask) -> Array:
-        """Return how much a neighbour counts around objects that are not followed: 0 to 1, (h, w) over the grid.
-
-        Beside them it does not count. Otherwise the noise would change from pixel to pixel, and the network takes
-        single noisy pixels for detail.
-        """
+        """Return how much a neighbour counts around objects that are not followed: 0 to 1, (h, w) over the grid."""
         share = to_grid(self._alignment, moved_objects.astype(np.float32), self._area)
         (near,) = means_around(share, [max(1, round(NEAR_OBJECTS / self._alignment.scale))])
         return np.maximum(1 - near / np.float32(FEW), 0)
 
-    def _as_bright(self, lrhs: Array) -> Array:
-        """Return how much a neighbour of this luminance counts where it may show another surface, too."""
-        difference = relative_difference(self._low_luminance, lrhs, self._light.darkest) / OTHER_BRIGHTNESS
-        with np.errstate(over="ignore"):
-            return np.asarray(1 / (1 + np.square(np.square(difference))), np.float32)
-
     def _fetch_low(self, neighbour: RenderPair, path: Path, valid: Mask, share: Array) -> tuple[Features, Mask]:
-        """Fetch a neighbour's LRHS over the grid pixels.
-
-        Returns:
-            Its features, and where they can be used: they lie in it, and enough HRLS pixels show the same surface.
-        """
+        """Fetch a neighbour's LRHS over the grid pixels, and where it shows enough of the same surface."""
         data = neighbour.alignment.lr_data_window
         x, y = self._low_positions(path, valid, share)
         usable = (x > data.x0 - 0.5) & (x < data.x1 - 0.5) & (y > data.y0 - 0.5) & (y < data.y1 - 0.5)
@@ -249,7 +222,7 @@ class RenderBand:
         x, y = np.clip(x, data.x0, data.x1 - 1), np.clip(y, data.y0, data.y1 - 1)
         top = max(int(np.floor(y.min())) - 1, data.y0)
         place = Window(data.x0, top, data.x1, min(int(np.floor(y.max())) + 3, data.y1))
-        pixels = _with_finite_passes(read(neighbour.lr, place, self._low_features))
+        pixels = _with_finite_passes(read(neighbour.lr, place, self._low_names))
         x, y = x - place.x0, y - place.y0
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
         smooth = [name for name in pixels if path.x is not None and (name in light or is_light_of_pass(name))]
@@ -281,14 +254,13 @@ class _Nearest:
         window = neighbour.alignment.hr_data_window
         place = path.place_in(window)
         self._size = path.valid.shape
-        pixels = read(neighbour.hr, place, features)
-        if not neighbour.hr_is_finite:
-            pixels = _with_finite_passes(pixels)
+        pixels = _with_finite_passes(read(neighbour.hr, place, features))
         self._planes = {name: _flat_planes(values) for name, values in pixels.items()}
         #: Flat indices in the data window; these pixels begin at ``_first``.
         self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
-        self._finite = None if neighbour.hr_is_finite else _finite_pixels(pixels)
-        self._luminance = None if neighbour.hr_luminance is None else neighbour.read_hr_luminance(place).reshape(-1)
+        self._finite = _finite_pixels(pixels)
+        whole = neighbour.hr_luminance
+        self._luminance = np.ravel(_luminance(pixels[RGB]) if whole is None else whole[place.slices(window)])
 
     def finite(self) -> Mask:
         """Return where all features are finite, (h, w)."""
@@ -298,16 +270,7 @@ class _Nearest:
 
     def luminance(self) -> Array:
         """Return the luminance (h, w) of the beauty, finite and >= 0."""
-        result = np.empty(self._size, np.float32)
-
-        def work(rows: slice) -> None:
-            if self._luminance is None:
-                result[rows] = _luminance(self.pixels(RGB, rows.start, rows.stop))
-            else:
-                self._luminance.take(self._indices(rows.start, rows.stop), out=result[rows], mode="wrap")
-
-        for_row_blocks(work, self._size[0], 3 * self._size[1])
-        return result
+        return self._luminance.take(self._indices(0, self._size[0]), mode="wrap")
 
     def pixels(self, name: str, start: int, stop: int) -> Array:
         """Return a feature at some rows (n, w, c). Pixels that are not finite are 0."""

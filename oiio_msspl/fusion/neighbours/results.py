@@ -16,7 +16,7 @@ from oiio_msspl.fusion.motion.shot import Motion
 from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.fusion.neighbours.bands import from_grid, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
-from oiio_msspl.fusion.neighbours.trust import Judge, Light, relative_difference
+from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.colour import luminance
@@ -33,8 +33,7 @@ class ResultBand:
     """Some rows of a fused frame, to which those of neighbours are added.
 
     Args:
-        frame: the frame.
-        light: its light.
+        frame, light: the frame and its light.
         images: gets colour and alpha over the rows of ``core`` of its data window.
         core, area: see :func:`oiio_msspl.fusion.neighbours.bands.for_bands`.
     """
@@ -42,69 +41,51 @@ class ResultBand:
     def __init__(self, frame: FusedFrame, light: Light, images: Images, core: Window, area: Window) -> None:
         self._light, self._area, self._window = light, area, frame.alignment.hr_data_window
         self._own = images_of(frame, area)
-        self._luminance = luminance(self._own[RGB])
-        #: The rows of ``core`` in the area.
         self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
         target = {name: image[core.slices(self._window)] for name, image in images.items()}
         for name, image in target.items():
             image[:] = self._own[name][self._rows]
         self._sum = WeightedSum(target)
         #: Where the frame may show two surfaces, by the motion to the nearest neighbour on a side.
-        self._borders: Mask | None = None
+        self._borders: Mask
 
     def add(self, hop: Hop[FusedFrame], path: Path, judge: Judge) -> None:
         """Add a fused neighbour that a path leads to."""
         alignment, area = self._light.alignment, self._area
         if path.hops == 1:
-            self._borders = self._find_borders(hop.there)
+            self._borders = _borders(hop.there, self._window, area)
+            if hop.there.moved_objects is not None:
+                self._borders |= grown(hop.there.moved_objects[area.slices(self._window)], 2)
         warped = _warp(hop.frame, path)
-        here, there = self._luminance, luminance(warped[RGB])
+        here, there = luminance(self._own[RGB]), luminance(warped[RGB])
         low = to_grid(alignment, np.where(path.valid, there, here), area)
         weight = from_grid(alignment, judge(low, low), area) * path.valid
-        mixed = _union(self._borders, _borders_at(hop, path))
-        if mixed is not None:
-            weight[mixed] *= _likeness(here[mixed], there[mixed], self._light.darkest)
+        mixed = self._borders | _borders_at(hop, path)
+        weight[mixed] *= likeness(here[mixed], there[mixed], self._light.darkest, DIFFERENT_MIX)
         # A neighbour may have no alpha.
         inside = {name: warped.get(name, image)[self._rows] for name, image in self._own.items()}
         self._sum.add(lambda name, rows: inside[name][rows], weight[self._rows])
 
     def finish(self) -> Array:
-        """Turn the sums into means. Return the number of frames, see :meth:`WeightedSum.divide`."""
+        """Turn the sums into means, and return the number of frames."""
         return self._sum.divide()
 
-    def _find_borders(self, motion: Motion) -> Mask | None:
-        """Find the pixels (h, w) of the area that may show two surfaces; None if nothing moves."""
-        part = self._area.slices(self._window)
-        moved = motion.moved_objects
-        return _union(_borders(motion, part), None if moved is None else grown(moved[part], 2))
 
-
-def _borders_at(hop: Hop[FusedFrame], path: Path) -> Mask | None:
-    """Find the pixels (h, w) that lead to pixels of a neighbour that may show two surfaces; None if nothing moves."""
+def _borders_at(hop: Hop[FusedFrame], path: Path) -> Mask:
+    """Find the pixels (h, w) that lead to pixels of a neighbour that may show two surfaces."""
     window = hop.frame.alignment.hr_data_window
     place = path.place_in(window)
-    borders = _borders(hop.back, place.slices(window))
-    if borders is None or path.nearest is None:
+    borders = _borders(hop.back, window, place)
+    if path.nearest is None:
         return borders
     return borders.reshape(-1).take(path.nearest - (place.y0 - window.y0) * window.width, mode="clip")
 
 
-def _borders(motion: Motion, part: tuple[slice, slice]) -> Mask | None:
-    """Return the borders of surfaces in a part of a frame; None if nothing moves."""
+def _borders(motion: Motion, window: Window, area: Window) -> Mask:
+    """Return the borders of surfaces (h, w) in an area of a frame."""
     if motion.vectors is None:
-        return None
-    return near_borders(motion.vectors[part], motion.tolerance) if motion.borders is None else motion.borders[part]
-
-
-def _union(first: Mask | None, second: Mask | None) -> Mask | None:
-    return first if second is None else second if first is None else first | second
-
-
-def _likeness(own: Array, other: Array, darkest: float) -> Array:
-    """Return how much pixels of these luminances count that may show other mixtures of two surfaces, from 0 to 1."""
-    difference = relative_difference(own, other, darkest)
-    with np.errstate(over="ignore"):
-        return np.asarray(1 / (1 + np.square(difference / np.float32(DIFFERENT_MIX))), np.float32)
+        return np.zeros((area.height, area.width), np.bool_)
+    return near_borders(motion.vectors[area.slices(window)], motion.tolerance)
 
 
 def _warp(frame: FusedFrame, path: Path) -> Images:

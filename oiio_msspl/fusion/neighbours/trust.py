@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.neighbours.bands import REACH, grid_rows
+from oiio_msspl.fusion.neighbours.bands import REACH, grid_window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import grown, max_3x3, means_around, sum_3x3
@@ -50,9 +50,8 @@ class Light:
 
     def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array, picture: Array) -> None:
         self.alignment = alignment
-        """Of the frame."""
+        #: Luminance that is added to the local brightness.
         self.darkest = DARKEST * float(picture.mean(dtype=np.float64)) + 1e-30
-        """Luminance that is added to the local brightness."""
         self._brightness = means_around(picture, [1])[0] + np.float32(self.darkest)
         self._renders = lrhs, hrls
         self._least, self._most = _bounds(lrhs, hrls)
@@ -70,10 +69,11 @@ class Light:
         than a nearer one: a light that has changed there has changed in the farther one.
         """
         trust: Array | np.float32 = np.float32(1)
+        rows, _ = grid_window(self.alignment, area).slices(self.alignment.grid)
 
         def judge(lrhs: Array, hrls: Array) -> Array:
             nonlocal trust
-            trust = np.minimum(trust, self._trust(lrhs, hrls, grid_rows(self.alignment, area)))
+            trust = np.minimum(trust, self._trust(lrhs, hrls, rows))
             return trust
 
         return judge
@@ -101,21 +101,22 @@ class Light:
 
 
 def _bounds(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
-    """Return the mean of 3 x 3 pixels (h, w) in the darker render, and their brightest pixel in either render.
-
-    A firefly is in one render alone. What is bright in both is a lamp, however small it is. Means over many pixels do
-    not notice it, and a thousandth of its light is seen on a dark wall.
-    """
+    """Return the mean of 3 x 3 pixels (h, w) in the darker render, and their brightest pixel in either render."""
+    # A firefly is in one render alone. A lamp, however small, is bright in both. Means over many pixels do not notice
+    # it, and a thousandth of its light is seen on a dark wall.
     least = np.minimum(*(sum_3x3(render) for render in (lrhs, hrls))) * np.float32(1 / 9)
     return least, max_3x3(np.maximum(lrhs, hrls))
 
 
-def relative_difference(own: Array, other: Array, darkest: float) -> Array:
-    """Return the difference of two luminances, divided by the root of their product.
+def likeness(own: Array, other: Array, darkest: float, half: float, *, steep: bool = False) -> Array:
+    """Return how much pixels of two luminances count for each other: 1 if equal, 0.5 at a difference of ``half``."""
+    with np.errstate(over="ignore"):
+        squares = np.square(relative_difference(own, other, darkest) / np.float32(half))
+        return np.asarray(1 / (1 + (np.square(squares) if steep else squares)), np.float32)
 
-    Args:
-        darkest: luminance that each of them counts as at least.
-    """
+
+def relative_difference(own: Array, other: Array, darkest: float) -> Array:
+    """Return the difference of two luminances of at least ``darkest``, divided by the root of their product."""
     own, other = (np.maximum(values, np.float32(darkest)) for values in (own, other))
     with np.errstate(over="ignore", under="ignore", divide="ignore"):  # the product could overflow, as the ratio may
         ratio = np.sqrt(own / other)

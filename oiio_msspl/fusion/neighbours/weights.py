@@ -47,8 +47,7 @@ class WeightedSum:
         """Turn the sums into means.
 
         Returns:
-            (h, w, 1): the number of images with equal weight whose mean would have the same noise; 1 where nothing was
-            added.
+            (h, w, 1): the number of images with equal weight whose mean would have the same noise, at least 1.
         """
 
         def work(rows: slice) -> None:

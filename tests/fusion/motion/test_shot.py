@@ -18,7 +18,6 @@ class Source:
     """A source of motion that notes which frames are read."""
 
     fields = ()
-    reads_one_frame = False
 
     def __init__(self, kind=VECTORS, vector=(2.0, 0.0), objects=None, zeros_are_right=True):
         self.kind, self.vector, self.objects, self.right = kind, vector, objects, zeros_are_right
@@ -42,11 +41,11 @@ def frame(number):
 
 def test_two_frames_are_read_once_and_in_one_order():
     source = Source()
-    motion = ShotMotion(source, with_borders=True)
+    motion = ShotMotion(source)
     back, forth = motion.between(frame(5), frame(4))
     assert source.reads == [(4, 5), (5, 4)]
     assert (forth.vectors[0, 0] == (2, 0)).all() and (back.vectors[0, 0] == (-2, 0)).all()
-    assert forth.known is None and not forth.borders.any() and forth.tolerance == ROUND_TRIP
+    assert forth.known is None and forth.tolerance == ROUND_TRIP
     assert motion.between(frame(4), frame(5)) == (forth, back)
     assert len(source.reads) == 2
     motion.keep({5, 6})
@@ -55,23 +54,23 @@ def test_two_frames_are_read_once_and_in_one_order():
 
 
 def test_vectors_of_flow_may_miss_by_more():
-    there, _ = ShotMotion(Source(FLOW), with_borders=False).between(frame(1), frame(2))
-    assert there.tolerance == ROUND_TRIP_OF_FLOW and there.borders is None
+    there, _ = ShotMotion(Source(FLOW)).between(frame(1), frame(2))
+    assert there.tolerance == ROUND_TRIP_OF_FLOW
 
 
 def test_a_camera_that_stands_still_is_read_one_way_and_moved_objects_are_not_known():
     objects = np.zeros(SIZE, bool)
     objects[2, 3] = True
     source = Source(STATIC, (0.0, 0.0), objects)
-    there, back = ShotMotion(source, with_borders=True).between(frame(2), frame(1))
+    there, back = ShotMotion(source).between(frame(2), frame(1))
     assert there == back and source.reads == [(1, 2)]
-    assert there.vectors is None and there.borders is None
+    assert there.vectors is None
     assert (there.known == ~objects).all() and (there.moved_objects == objects).all()
 
 
 def test_zeros_that_are_wrong_are_refused_each_time():
     source = Source(vector=(0.0, 0.0), zeros_are_right=False)
-    motion = ShotMotion(source, with_borders=True)
+    motion = ShotMotion(source)
     for _ in range(2):
         with pytest.raises(InputError, match="between frames 1 and 2 are 0, though the picture moves"):
             motion.between(frame(2), frame(1))

@@ -17,8 +17,9 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.source import MotionFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
+from oiio_msspl.fusion.passes.layers import is_large
 from oiio_msspl.image.arrays import Array, Mask, kept
-from oiio_msspl.jobs.memory import ViewMemory, is_large
+from oiio_msspl.jobs.memory import ViewMemory
 from oiio_msspl.jobs.passes import Progress
 from oiio_msspl.jobs.plan import ViewPlan
 from oiio_msspl.jobs.report import FrameReport

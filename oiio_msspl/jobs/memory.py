@@ -17,6 +17,7 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.fusion.neighbours.average import memory_to_average_renders, memory_to_average_results
+from oiio_msspl.fusion.passes.layers import is_large
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, TILE_MEMORY, memory_to_fuse, require_memory, result_bytes
 from oiio_msspl.image.arrays import has_many_pixels
@@ -210,11 +211,6 @@ def require_frame_memory(
     only_layout = write.layout == "multilayer" and to_fuse + held <= max_memory
     hint = ", or use --layout spec, which does not hold all layers at once" if only_layout else ""
     require_memory(max(to_fuse, to_write) + held, session.contract, max_memory, hint)
-
-
-def is_large(hr: MappedRender) -> bool:
-    """Return whether a frame has so many pixels that what waits of it may lie in temporary files."""
-    return has_many_pixels(hr.data_window.height, hr.data_window.width)
 
 
 def light_features(render: MappedRender) -> list[str]:

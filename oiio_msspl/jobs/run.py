@@ -24,13 +24,14 @@ from oiio_msspl.fusion.neighbours.average import average_renders, average_result
 from oiio_msspl.fusion.neighbours.hops import find_hops
 from oiio_msspl.fusion.neighbours.path import Hop
 from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes
+from oiio_msspl.fusion.passes.layers import is_large
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import require_memory
 from oiio_msspl.image.arrays import kept
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State
 from oiio_msspl.jobs.inputs import MappedPair
-from oiio_msspl.jobs.memory import check_frame_memory, is_large, light_features
+from oiio_msspl.jobs.memory import check_frame_memory, light_features
 from oiio_msspl.jobs.passes import Progress, fuse_frame_passes, steps_of, uses_clean_aovs
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.read import features_read, read_frame

@@ -30,7 +30,7 @@ from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot
 
 
 def run(folder, model, **more):
-    """Fuse a shot frame by frame. tests/jobs/test_temporal.py has shots whose frames depend on each other."""
+    """Fuse a shot frame by frame. tests/jobs/test_over_time.py has shots whose frames depend on each other."""
     more = {"temporal": TemporalOptions("off")} | more
     return fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(model), **more)
 

@@ -140,11 +140,12 @@ class MappedRender:
         self, window: Window, features: Iterable[str] | None, more: Sequence[Channel]
     ) -> tuple[dict[str, Array], Array]:
         """Read features and, as they are stored, more channels, (height, width, channels)."""
-        available, beauty = self._formulas, self.features[RGB].terms[0]
+        available = self._formulas
         names = (*FEATURES, "alpha") if features is None else features
         formulas = {name: available[name] for name in names if name in available}
+        beauty = self.features[RGB].terms[0] if VARIANCE in formulas else ()
         needed = [c for formula in formulas.values() for c in formula.channels]
-        channels = list(dict.fromkeys([*needed, *(beauty if VARIANCE in formulas else ()), *more]))
+        channels = list(dict.fromkeys([*needed, *beauty, *more]))
         pixels = self.file.read(channels, window)
         place = {channel: i for i, channel in enumerate(channels)}
 

@@ -182,6 +182,6 @@ class ShotFrame:
 
     def forget_all_but_picture(self) -> None:
         """Give up what only this frame's own result needs."""
-        self.means = None
+        self.means = self.frame_counts = None
         if self.fused is not None:
             self.fused = replace(self.fused, clean_aovs={}, error=None, frames=None)

@@ -15,7 +15,7 @@ from oiio_msspl.aovs.features import ALBEDO, RGB
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.alpha import fuse_alpha
-from oiio_msspl.fusion.tiles.guards import LAYER_REACH, check_finite
+from oiio_msspl.fusion.tiles.guards import LAYER_REACH, black_in_both, check_finite
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile
 from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
@@ -99,6 +99,13 @@ def _fuse_tile(task: TileTask, session: Session) -> None:
     features, empty = tile.features, tile.empty
     target = features.hrls_target.slices(result.alignment.hr_data_window)
     core = features.hrls_target.slices(features.hrls_area)
+    if "alpha" in features.hrls:
+        if result.alpha is None:
+            result.alpha = np.empty((*result.rgb.shape[:2], 1), dtype=np.float32)
+        alpha = fuse_alpha(features, session, alpha_shares, trust=result.trust is not None)
+        result.alpha[target] = alpha[core]
+        if empty is not None and tile.lrhs is not None and tile.hrls is not None:
+            empty = empty | black_in_both(tile.lrhs[RGB], tile.hrls[RGB]) & (alpha == 0)
     if tile.hrls is not None:
         images = _run_network(tile, session, result.exposure, shares, error=result.error is not None)
         for name in tile.aovs:
@@ -120,10 +127,6 @@ def _fuse_tile(task: TileTask, session: Session) -> None:
             if empty is not None:
                 error *= ~empty
             result.error[target] = error[core]
-    if "alpha" in features.hrls:
-        if result.alpha is None:
-            result.alpha = np.empty((*result.rgb.shape[:2], 1), dtype=np.float32)
-        result.alpha[target] = fuse_alpha(features, session, alpha_shares)[core]
 
 
 def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shares, reach: int) -> Array:

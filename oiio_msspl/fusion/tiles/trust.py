@@ -47,9 +47,9 @@ class Renders(NamedTuple):
     """Both renders of a tile, and what is known of their noise."""
 
     lrhs: Array
-    """(h, w, 3), scene linear."""
+    """(h, w, c), scene linear."""
     hrls: Array
-    """(s*h, s*w, 3), scene linear. At scale 1, the second render of the same size."""
+    """(s*h, s*w, c), scene linear. At scale 1, the second render of the same size."""
     share: float
     """Share of the LRHS in the mean of both renders that has the least noise."""
     exposure: float
@@ -67,12 +67,12 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     Detail is taken from the HRLS, or from the mean of two renders of one size.
 
     Args:
-        fused: the network's picture (s*h, s*w, 3), scene linear.
+        fused: the network's picture (s*h, s*w, c), scene linear.
         renders: the renders of the tile, without fireflies.
         reach: the largest distance, in LRHS pixels, over which a pixel may depend on others.
 
     Returns:
-        The picture (s*h, s*w, 3), >= 0, and how much of the HRLS's difference was put back, (h, w) in [0, 1].
+        The picture (s*h, s*w, c), >= 0, and how much of the HRLS's difference was put back, (h, w) in [0, 1].
     """
     picture, low, high = (planes_of(image) for image in (fused, renders.lrhs, renders.hrls))
     means = np.stack([box_downsample(plane, renders.scale) for plane in high])
@@ -94,13 +94,13 @@ def _trust_in_detail(
     The second result is the part of it that is judged pixel by pixel.
 
     Args:
-        fused, lrhs, detailed: planes (3, h, w) or (3, s*h, s*w).
+        fused, lrhs, detailed: planes (c, h, w) or (c, s*h, s*w).
         means: those of the HRLS over LRHS pixels.
         renders, reach: as in :func:`trust_renders`.
     """
     scale = renders.scale
     brightness = _brightness(box_downsample(fused.mean(axis=0), scale), renders.exposure)
-    weight = np.float32(1 / 3) / np.square(brightness)
+    weight = np.divide(np.float32(1 / len(fused)), np.square(brightness), dtype=np.float32)
     squares = reduce(np.add, (np.square(a - b) for a, b in zip(detailed, fused, strict=True)))
     energy: Array = weight * box_downsample(squares, scale)
     # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of

@@ -14,7 +14,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.checks.pair import HrlsAverages, bounded_luminance, check_pair, has_same_noise
+from oiio_msspl.fusion.checks.pair import HrlsAverages, are_not_independent, bounded_luminance, check_pair
 from oiio_msspl.fusion.passes.fuse import FusedPasses
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
@@ -111,7 +111,7 @@ def fuse(
                 if progress is not None:
                     progress(task.number, task.count)
                 del task  # or its memory would be held while the next one is fused
-        if frame.trust is not None and has_same_noise(averages):
+        if frame.trust is not None and are_not_independent(averages):
             # The noise of one render can't be told from detail by that of the other one.
             return fuse(
                 lr,

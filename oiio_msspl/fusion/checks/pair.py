@@ -54,6 +54,9 @@ BLOCK = 4
 #: The LRHS has the noise of the HRLS if, in three of four blocks, they differ by less than this fraction of the HRLS's
 #: noise. Independent renders differ by the noise of both, so by more than 1.
 SAME_NOISE = 0.75
+#: Both renders are equal in a block if they differ by this fraction of its brightness, RMS. Independent renders of
+#: thousands of spp differ by more.
+EQUAL = 0.002
 #: A block has noise if its RMS is this fraction of the block's brightness.
 NOISY = 0.01
 #: Noise is not compared if there are fewer noisy blocks.
@@ -227,7 +230,7 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
     ]
     framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
-    if has_same_noise(hrls):
+    if _has_same_noise(hrls):
         warnings.append(
             "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "
             "with more spp, and not made by scaling the HRLS down"
@@ -287,7 +290,15 @@ def _is_region(black: Array, lit: Array) -> bool:
     return bool(lit_pixels > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
 
 
-def has_same_noise(hrls: HrlsAverages) -> bool:
+def are_not_independent(hrls: HrlsAverages) -> bool:
+    """Return whether the LRHS equals the means of the HRLS where the HRLS varies, so that it shows no noise."""
+    brightness, difference, expected = hrls.blocks[..., :6].sum(axis=-1) / 6, hrls.blocks[..., 6], hrls.blocks[..., 7]
+    varied = expected * BLOCK**2 > np.square(NOISY * brightness)
+    equal = varied & (difference * BLOCK**2 < np.square(EQUAL * brightness))
+    return np.count_nonzero(varied) >= MIN_NOISY_BLOCKS and 4 * np.count_nonzero(equal) > 3 * np.count_nonzero(varied)
+
+
+def _has_same_noise(hrls: HrlsAverages) -> bool:
     """Return whether the LRHS is the HRLS scaled down, by averaging pixels or by keeping some of them."""
     colours, difference, expected = hrls.blocks[..., :6], hrls.blocks[..., 6], hrls.blocks[..., 7]
     brightness = colours.sum(axis=-1) / 6

@@ -12,7 +12,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels, stored_type
-from oiio_msspl.exr.render import Render
+from oiio_msspl.exr.render import ReadableRender, Render
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes, pass_steps
@@ -79,6 +79,7 @@ def fuse_frame_passes(
     max_memory: int,
     progress: Callable[[int, int], None] | None = None,
     averaged: tuple[Render, Render] | None = None,
+    decoded: tuple[ReadableRender, ReadableRender] | None = None,
 ) -> None:
     """Fuse the additive sets of :func:`sets_to_fuse` and add them to ``fused``.
 
@@ -89,7 +90,7 @@ def fuse_frame_passes(
         write: ``passes`` says which, and ``pixel_type`` how the beauty is stored.
         max_memory: bytes that the process should stay below.
         progress: called with (steps done, steps in all) of this part of the work.
-        averaged: see :class:`oiio_msspl.fusion.passes.fuse.PassInputs`.
+        averaged, decoded: see :class:`oiio_msspl.fusion.passes.fuse.PassInputs`.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -103,7 +104,7 @@ def fuse_frame_passes(
             beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
         with limit_threads(session.threads):
             fused.passes = fuse_passes(
-                PassInputs(lr, hr, beauty, fused.alignment, sets, fused.clean_aovs, averaged),
+                PassInputs(lr, hr, beauty, fused.alignment, sets, fused.clean_aovs, averaged, decoded),
                 fused.replaced,
                 fuse_layers=layer_fuser(session, fused),
                 cache_bytes=strips_memory(max_memory, fused.nbytes),

@@ -224,9 +224,16 @@ class ShotRun:
 
     def _fuse_passes(self, frame: ShotFrame, picture: FusedFrame) -> None:
         """Fuse the passes of a view and add them to its final picture."""
-        room = self.settings.max_memory - frame.held_bytes
         fuse_frame_passes(
-            frame.lr, frame.hr, picture, frame.session, frame.write, room, frame.progress, averaged=frame.means
+            frame.lr,
+            frame.hr,
+            picture,
+            frame.session,
+            frame.write,
+            self.settings.max_memory - frame.held_bytes,
+            frame.progress,
+            averaged=frame.means,
+            decoded=(frame.renders.lr, frame.renders.hr),
         )
 
     def _unplanned_views(self, first: ShotFrame) -> list[str]:

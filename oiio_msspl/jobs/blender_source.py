@@ -22,11 +22,10 @@ from oiio_msspl.fusion.tiles.tiling import result_bytes
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.inputs import map_pair
 from oiio_msspl.jobs.memory import memory_to_average, require_frame_memory
-from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.plan import AUTO, ShotPlan, TemporalOptions, ViewPlan, reach_of
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
-from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.settings import Settings, choose_model
 from oiio_msspl.jobs.timeline import neighbours
 from oiio_msspl.jobs.write import write_settled
 from oiio_msspl.model.catalogue import family_of

@@ -133,17 +133,14 @@ def painting() -> Material:
     return mat
 
 
-def glass(caustics: bool) -> Material:
-    """Plain glass, or glass whose shadow is clear so that path tracing it stays quiet."""
+def glass() -> Material:
+    """Glass whose shadow is clear, so that path tracing it stays quiet."""
     mat = bpy.data.materials.new("Glass")
     mat.use_nodes = True
     nt = mat.node_tree
     nt.nodes.clear()
     out = nt.nodes.new("ShaderNodeOutputMaterial")
     bsdf = node(nt, "ShaderNodeBsdfGlass", Color=rgb(0.95, 0.985, 0.97), Roughness=0.0, IOR=1.45)
-    if caustics:
-        nt.links.new(bsdf.outputs[0], out.inputs["Surface"])
-        return mat
     path = nt.nodes.new("ShaderNodeLightPath")
     clear = node(nt, "ShaderNodeBsdfTransparent", Color=rgb(0.86, 0.90, 0.88))
     mix = nt.nodes.new("ShaderNodeMixShader")
@@ -274,7 +271,7 @@ def label(text: str, size: float, mat: Material, at: Point, rotation: Point = (9
 
 
 # -------------------------------------------------------------------- scene
-def build_scene(seed: int, transparent: bool = False, caustics: bool = False) -> Any:
+def build_scene(seed: int, transparent: bool = False) -> Any:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     _index[0] = 0
     rng = random.Random(seed)
@@ -322,7 +319,7 @@ def build_scene(seed: int, transparent: bool = False, caustics: bool = False) ->
     table = (0.74, 0.62, 0.74)
     cone("Table Leg", 0.20, 0.05, 0.72, oak, (table[0], table[1], 0.36))
     cloth("Tablecloth", tablecloth(), table)
-    sphere("Glass Ball", 0.22, glass(caustics), (table[0] - 0.12, table[1] - 0.14, table[2] + 0.22))
+    sphere("Glass Ball", 0.22, glass(), (table[0] - 0.12, table[1] - 0.14, table[2] + 0.22))
     china = new_material("China", Base_Color=rgb(0.80, 0.82, 0.86), Roughness=0.08)[0]
     sphere("Pearl", 0.085, china, (table[0] + 0.26, table[1] - 0.20, table[2] + 0.085))
     red = new_material("Red Lacquer", Base_Color=rgb(0.62, 0.03, 0.03), Roughness=0.12, Coat_Weight=1.0)[0]
@@ -451,7 +448,7 @@ def configure(scene: Any, args: argparse.Namespace) -> None:
     c.sampling_pattern = "TABULATED_SOBOL"
     c.use_animated_seed = False
     c.pixel_filter_type, c.filter_width = args.filter, 1.5
-    c.caustics_reflective = c.caustics_refractive = args.caustics
+    c.caustics_reflective = c.caustics_refractive = False
     c.max_bounces, c.diffuse_bounces, c.glossy_bounces, c.transmission_bounces = 8, 4, 4, 8
     r = scene.render
     r.threads_mode, r.threads = "FIXED", args.threads
@@ -465,13 +462,11 @@ def configure(scene: Any, args: argparse.Namespace) -> None:
     if V5:
         image.media_type = "MULTI_LAYER_IMAGE"
     image.file_format = "OPEN_EXR_MULTILAYER"
-    image.color_depth = "16" if args.half else "32"
-    image.exr_codec = args.codec
+    image.color_depth = "32" if args.float else "16"
+    image.exr_codec = "ZIP"
     if V5:
         image.use_exr_interleave = args.interleave
     layer = scene.view_layers[0]
-    if args.view_layer:
-        layer.name = args.view_layer
     for flag in PASSES_LEAN if args.lean else PASSES_ALL:
         setattr(layer, f"use_pass_{flag}", True)
     layer.cycles.denoising_store_passes = True
@@ -506,24 +501,16 @@ def parse(argv: list[str]) -> argparse.Namespace:
     p.add_argument("--out", type=Path, required=True, metavar="DIR")
     p.add_argument("--size", type=size, default=(512, 384), metavar="WxH", help="size of the HRLS render")
     p.add_argument("--scale", type=int, default=4, help="LRHS is rendered at 1/scale of the size")
-    p.add_argument("--lr-size", type=size, metavar="WxH", help="size of the LRHS render, over --scale")
     p.add_argument("--hr-spp", type=int, default=1)
     p.add_argument("--lr-spp", type=int, default=16)
     p.add_argument("--ref-spp", type=int, default=0, help="0: no reference")
-    p.add_argument("--only", default="hr,lr,ref", help="which of the renders to make")
-    p.add_argument("--suffix", default="", help="appended to the file names")
     p.add_argument("--filter", choices=("BOX", "BLACKMAN_HARRIS"), default="BOX")
     p.add_argument("--transparent", action="store_true", help="transparent film, no back wall")
-    depth = p.add_mutually_exclusive_group()
-    depth.add_argument("--half", dest="half", action="store_true", default=True)
-    depth.add_argument("--float", dest="half", action="store_false")
-    p.add_argument("--codec", default="ZIP")
+    p.add_argument("--float", action="store_true", help="store 32 bits")
     p.add_argument("--interleave", action="store_true", help="Blender 5: one part with every pass")
     p.add_argument("--border", type=border, metavar="X0,Y0,X1,Y1", help="region in fractions, y upwards")
     p.add_argument("--crop", action="store_true", help="crop the file to the region")
     p.add_argument("--lean", action="store_true", help="few passes")
-    p.add_argument("--caustics", action="store_true")
-    p.add_argument("--view-layer", help="name of the view layer")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--threads", type=int, default=1)
     return p.parse_args(argv)
@@ -532,17 +519,16 @@ def parse(argv: list[str]) -> argparse.Namespace:
 def main(argv: list[str]) -> None:
     args = parse(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    scene = build_scene(args.seed, args.transparent, args.caustics)
+    scene = build_scene(args.seed, args.transparent)
     configure(scene, args)
-    wanted = args.only.split(",")
     w, h = args.size
     # rounded up: an LRHS render covers all of the frame
-    low = args.lr_size or (-(-w // args.scale), -(-h // args.scale))
+    low = -(-w // args.scale), -(-h // args.scale)
     # every render has a seed of its own, else the samples of one would be nested in another's
     jobs = [("hr", (w, h), args.hr_spp, 1), ("lr", low, args.lr_spp, 2), ("ref", (w, h), args.ref_spp, 3)]
     for name, size, spp, offset in jobs:
-        if name in wanted and spp > 0:
-            path = args.out.resolve() / f"{name}{args.suffix}.exr"
+        if spp > 0:
+            path = args.out.resolve() / f"{name}.exr"
             render(scene, path, size, spp, 1000 * args.seed + offset, args.border, args.crop)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from research.datagen import command_line
 
@@ -13,6 +14,9 @@ from . import start
 def main() -> int:
     """Run the command line and return the exit code."""
     parser = command_line.parser("research.datagen.mitsuba", "Render training views with Mitsuba 3.", ref_spp=96)
+    parser.add_argument(
+        "--assets", type=Path, help="folder with hdri/ and models/; without it all content is procedural"
+    )
     parser.add_argument("--variant", default=start.VARIANT, help="of Mitsuba (default: %(default)s)")
     args = parser.parse_args()
     start.start(args.threads, args.variant)

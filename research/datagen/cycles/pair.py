@@ -193,9 +193,9 @@ def tube(name: str, points: list[Point], radius: float, mat: Material) -> Any:
     return finish(ob, mat)
 
 
-def cloth(name: str, mat: Material, at: Point, radius: float = 0.56, drop: float = 0.50) -> Any:
+def cloth(name: str, mat: Material, at: Point) -> Any:
     """Make a round tablecloth: a flat top, a rounded edge and folds that grow towards the hem."""
-    n, rings = 220, 44
+    n, rings, radius, drop = 220, 44, 0.56, 0.50
     total = radius + drop
     verts: list[Point] = [(0, 0, 0)]
     flat: list[tuple[float, float]] = [(0, 0)]  # where the point lay before it was draped
@@ -221,12 +221,10 @@ def cloth(name: str, mat: Material, at: Point, radius: float = 0.56, drop: float
     return ob
 
 
-def grass(
-    name: str, rng: random.Random, mat: Material, at: Point, radius: float, height: float, count: int = 260
-) -> Any:
+def grass(name: str, rng: random.Random, mat: Material, at: Point, radius: float, height: float) -> Any:
     verts: list[Any] = []
     faces: list[Any] = []
-    for _ in range(count):
+    for _ in range(260):
         a, r = rng.uniform(0, 2 * math.pi), radius * math.sqrt(rng.random())
         base = Vector((r * math.cos(a), r * math.sin(a), 0))
         lean = Vector((math.cos(a), math.sin(a), 0)) * rng.uniform(0.05, 0.75) * (0.3 + r / radius)
@@ -255,11 +253,11 @@ def cone(name: str, r1: float, r2: float, depth: float, mat: Material, at: Point
     return finish(ob, mat)
 
 
-def label(text: str, size: float, mat: Material, at: Point, rotation: Point = (90, 0, 0)) -> Any:
+def label(text: str, size: float, mat: Material, at: Point) -> Any:
     curve = bpy.data.curves.new("Text", "FONT")
     curve.body, curve.size, curve.align_x = text, size, "CENTER"
     ob = bpy.data.objects.new(f"Text {text}", curve)
-    ob.location, ob.rotation_euler = at, [math.radians(d) for d in rotation]
+    ob.location, ob.rotation_euler = at, (math.radians(90), 0, 0)
     bpy.context.scene.collection.objects.link(ob)
     return finish(ob, mat)
 

@@ -56,8 +56,8 @@ def light_of(
         InputError: pixels can't be decoded.
     """
     file = with_light(render, names)
-    needed = {RGB, ALBEDO, NORMAL, *names.values(), *_colours(names).values()}.intersection(file.features)
-    if isinstance(decoded, Render) and decoded.layers.keys() >= needed:
+    needed = [RGB, ALBEDO, NORMAL, *names.values(), *_colours(names).values()]
+    if isinstance(decoded, Render) and decoded.layers.keys() >= file.features.keys() & {*needed}:
         return LayerLight(file, names, decoded)
     return LayerLight(file, names, file.load(needed, on_disk=is_large(file)) if decode else file)
 

@@ -86,6 +86,10 @@ Passes = Annotated[list[str], option(OUTPUT, _PASSES, metavar="PATTERN")]
 ErrorLayer = Annotated[
     bool, option(OUTPUT, "Add a layer 'error': the error that the model expects in each pixel.", "--error-layer")
 ]
+_TRUST = "Put back what both renders show and the network has removed (on), or keep the network's picture (off)."
+Trust = Annotated[str, option(OUTPUT, _TRUST, "--trust", metavar="on|off", hidden=True)]
+_TRUST_LAYER = "Add a layer 'trust': how much of what the network removed was put back, from 0 to 1."
+TrustLayer = Annotated[bool, option(OUTPUT, _TRUST_LAYER, "--trust-layer", hidden=True)]
 _DATA_PASSES = "Add the layers 'denoised_albedo' and 'denoised_normal'. It needs --quality best."
 DataPasses = Annotated[bool, option(OUTPUT, _DATA_PASSES, "--data-passes", hidden=True)]
 Overwrite = Annotated[bool, option(OUTPUT, "Replace existing files.", "--overwrite")]
@@ -178,11 +182,13 @@ def make_write_options(
     passes: list[str] | None = None,
     frames_layer: bool = False,
     data_passes: bool = False,
+    trust: str = "on",
+    trust_layer: bool = False,
 ) -> WriteOptions:
     """Return the options that describe the result.
 
     Raises:
-        InputError: an unknown layout or compression.
+        InputError: an unknown layout, compression or value of ``--trust``.
     """
     from oiio_msspl.exr.write_options import WriteOptions
 
@@ -190,8 +196,19 @@ def make_write_options(
     if passes and "auto" in passes and len(passes) > 1:
         raise InputError(f"--passes {', '.join(passes)}: auto fuses all sets; leave it out, or the others")
     patterns = () if passes == ["auto"] else tuple(passes or ())
+    if trust not in ("on", "off"):
+        raise InputError(f"--trust {trust!r}: use on or off")
     return WriteOptions(
-        layout, compression, pixel_type, tuple(layers), patterns, error_layer, frames_layer, data_passes
+        layout,
+        compression,
+        pixel_type,
+        tuple(layers),
+        patterns,
+        error_layer,
+        frames_layer,
+        trust=trust == "on",
+        trust_layer=trust_layer,
+        data_passes=data_passes,
     )
 
 

@@ -14,7 +14,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.checks.pair import HrlsAverages, bounded_luminance, check_pair
+from oiio_msspl.fusion.checks.pair import HrlsAverages, bounded_luminance, check_pair, has_same_noise
 from oiio_msspl.fusion.passes.fuse import FusedPasses
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
@@ -62,6 +62,7 @@ def fuse(
     session: Session,
     *,
     error: bool = False,
+    trust: bool = True,
     clean_aovs: bool = False,
     half: bool = False,
     max_memory: int = MAX_MEMORY,
@@ -74,6 +75,8 @@ def fuse(
         lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.matching.map_render`), or renders in memory.
         session: a model for the scale of the pair.
         error: also predict the error of the result.
+        trust: put back detail and light that both renders show, see
+            :func:`oiio_msspl.fusion.tiles.trust.trust_renders`.
         clean_aovs: also keep the albedo and the normal that the model denoises, see :attr:`Session.clean_aovs`.
         half: keep the result as half floats, in half the memory. Values above ``HALF_MAX`` are clipped.
         max_memory: bytes that the whole process should stay below. The result does not depend on it.
@@ -96,6 +99,8 @@ def fuse(
         rgb: NDArray[Any] = blank((*size, 3), np.float16 if half else np.float32, on_disk=False)
         errors: Array | None = blank((*size, 1), on_disk=False) if error else None
         frame = FusedFrame(rgb, None, errors, alignment, pair.exposure, {})
+        if trust and session.contract.denoiser:
+            frame.trust = blank((alignment.grid.height, alignment.grid.width), on_disk=False)
         with hr.cache_strips(strips_memory(max_memory, held)):
             for task in fuse_tiles(tile_tasks(pair, frame), session):
                 frame.tiles = task.count
@@ -106,6 +111,20 @@ def fuse(
                 if progress is not None:
                     progress(task.number, task.count)
                 del task  # or its memory would be held while the next one is fused
+        if frame.trust is not None and has_same_noise(averages):
+            # The noise of one render can't be told from detail by that of the other one.
+            return fuse(
+                lr,
+                hr,
+                session,
+                error=error,
+                trust=False,
+                clean_aovs=clean_aovs,
+                half=half,
+                max_memory=max_memory,
+                held=held,
+                progress=progress,
+            )
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb

@@ -135,6 +135,20 @@ def max_3x3(values: Array) -> Array:
     return largest
 
 
+def max_around(plane: Array, reach: int) -> Array:
+    """Return the largest value up to ``reach`` rows and columns away from each pixel, (h, w)."""
+    for axis in (0, 1):
+        distance, left = 1, reach
+        while left > 0:  # windows that overlap double their reach with each maximum
+            step = min(distance, left)
+            lines = plane.swapaxes(0, axis)
+            largest = lines.copy()
+            np.maximum(largest[step:], lines[:-step], out=largest[step:])
+            np.maximum(largest[:-step], lines[step:], out=largest[:-step])
+            plane, left, distance = largest.swapaxes(0, axis), left - step, 2 * distance
+    return plane
+
+
 def sum_3x3(values: Array) -> Array:
     """Return the sum of the 3 x 3 values around each pixel, (h, w, ...). The edge pixel is repeated."""
     for axis in (1, 0):

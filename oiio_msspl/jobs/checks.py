@@ -11,7 +11,14 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, make_folder
-from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
+from oiio_msspl.exr.write_options import (
+    ALBEDO_LAYER,
+    ERROR_LAYER,
+    FRAMES_LAYER,
+    NORMAL_LAYER,
+    TRUST_LAYER,
+    WriteOptions,
+)
 from oiio_msspl.exr.writer import check_layout
 from oiio_msspl.fusion.fuse import check_model
 from oiio_msspl.fusion.tiles.alignment import align
@@ -111,6 +118,7 @@ def check_written_layers(hr: MappedRender, write: WriteOptions) -> None:
     wanted = {
         ERROR_LAYER: write.error_layer,
         FRAMES_LAYER: write.frames_layer,
+        TRUST_LAYER: write.trust_layer,
         ALBEDO_LAYER: write.data_passes and ALBEDO in hr.features,
         NORMAL_LAYER: write.data_passes and NORMAL in hr.features,
     }

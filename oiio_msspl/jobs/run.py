@@ -174,6 +174,7 @@ class ShotRun:
             frame.averaged.hr,
             frame.session,
             error=frame.write.error_layer,
+            trust=frame.write.trust,
             clean_aovs=uses_clean_aovs(frame.hr, frame.write),
             half=half,
             max_memory=self.settings.max_memory,

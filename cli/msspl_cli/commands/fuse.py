@@ -90,6 +90,8 @@ def fuse(
     passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
     data_passes: options.DataPasses = False,
+    trust: options.Trust = "on",
+    trust_layer: options.TrustLayer = False,
     compression: Annotated[str | None, option(OUTPUT, _COMPRESSION, metavar="NAME", hidden=True)] = None,
     half: Annotated[
         bool | None, option(OUTPUT, "Set the fused layer's type. \\[default: as HR]", "--half/--float", hidden=True)
@@ -141,7 +143,7 @@ def fuse(
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
         "write": options.make_write_options(
-            layout, compression, half, layers, error_layer, passes, frames_layer, data_passes
+            layout, compression, half, layers, error_layer, passes, frames_layer, data_passes, trust, trust_layer
         ),
         "model": options.choose_model(model, quality),
         "device": device,
@@ -234,6 +236,8 @@ def _print(report: FrameReport, seconds: float) -> None:
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
     for name, outcome in report.passes.items():
         console.say(f"  {name}: {outcome}")
+    if report.trust is not None and report.trust >= 0.005:
+        console.say(f"Put back {report.trust:.0%} of what the network had removed: both renders show it.")
     for text, counts in (
         ("Repaired values that were NaN or infinite", report.repaired),
         ("Set negative values to 0 (colours out of gamut)", report.negative),

@@ -82,6 +82,8 @@ def render(
     passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
     data_passes: options.DataPasses = False,
+    trust: options.Trust = "on",
+    trust_layer: options.TrustLayer = False,
     keep: Annotated[
         bool, option(OUTPUT, "Keep both renders beside OUT: OUT_lr.exr, OUT_hr.exr.", "--keep", hidden=True)
     ] = False,
@@ -128,7 +130,9 @@ def render(
     _check_files(scene, output, targets, extras, overwrite=overwrite, skip_existing=skip_existing)
     use_threads(threads)
     settings = Settings(
-        write=options.make_write_options(layout, None, None, [], error_layer, passes, data_passes=data_passes),
+        write=options.make_write_options(
+            layout, None, None, [], error_layer, passes, False, data_passes, trust, trust_layer
+        ),
         model=options.choose_model(model, quality),
         device=device,
         threads=threads,

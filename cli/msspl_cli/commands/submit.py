@@ -71,8 +71,9 @@ def submit(
     # A wrong value is refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
-    written = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
-    write = options.make_write_options(**{name: given[name] for name in written})
+    written = ("layout", "compression", "half", "layers", "passes", "trust")
+    added = ("error_layer", "frames_layer", "trust_layer", "data_passes")
+    write = options.make_write_options(**{name: given[name] for name in (*written, *added)})
     temporal = TemporalOptions(given["temporal"], given["motion_format"])
     max_memory = options.parse_bytes(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])

@@ -227,7 +227,7 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
     ]
     framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
-    if _has_same_noise(hrls):
+    if has_same_noise(hrls):
         warnings.append(
             "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "
             "with more spp, and not made by scaling the HRLS down"
@@ -287,7 +287,7 @@ def _is_region(black: Array, lit: Array) -> bool:
     return bool(lit_pixels > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
 
 
-def _has_same_noise(hrls: HrlsAverages) -> bool:
+def has_same_noise(hrls: HrlsAverages) -> bool:
     """Return whether the LRHS is the HRLS scaled down, by averaging pixels or by keeping some of them."""
     colours, difference, expected = hrls.blocks[..., :6], hrls.blocks[..., 6], hrls.blocks[..., 7]
     brightness = colours.sum(axis=-1) / 6

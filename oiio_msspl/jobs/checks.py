@@ -24,12 +24,11 @@ from oiio_msspl.fusion.fuse import check_model
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.memory import check_frame_memory
-from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.passes import check_passes
 from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
-from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.settings import Settings, choose_model
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import family_of, for_spread_noise
 

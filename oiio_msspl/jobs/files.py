@@ -17,12 +17,11 @@ from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.memory import memory_to_write
-from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, is_sequence
-from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.settings import Settings, choose_model
 from oiio_msspl.jobs.write import write_settled
 
 

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
@@ -24,15 +26,18 @@ from oiio_msspl.fusion.neighbours.average import average_renders, average_result
 from oiio_msspl.fusion.neighbours.hops import find_hops
 from oiio_msspl.fusion.neighbours.path import Hop
 from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes
+from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import is_large
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.tiling import require_memory
-from oiio_msspl.image.arrays import kept
+from oiio_msspl.fusion.tiles.network import layer_fuser
+from oiio_msspl.fusion.tiles.tiling import require_memory, strips_memory
+from oiio_msspl.image.arrays import HALF_MAX, kept
+from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State
 from oiio_msspl.jobs.inputs import MappedPair
 from oiio_msspl.jobs.memory import check_frame_memory, light_features
-from oiio_msspl.jobs.passes import Progress, fuse_frame_passes, steps_of, uses_clean_aovs
+from oiio_msspl.jobs.passes import Progress, sets_to_fuse, steps_of, uses_clean_aovs
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.read import features_read, read_frame
 from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, written_layers
@@ -225,10 +230,26 @@ class ShotRun:
 
     def _fuse_passes(self, frame: ShotFrame, picture: FusedFrame) -> None:
         """Fuse the passes of a view and add them to its final picture."""
-        room = self.settings.max_memory - frame.held_bytes
-        fuse_frame_passes(
-            frame.lr, frame.hr, picture, frame.session, frame.write, room, frame.progress, averaged=frame.means
-        )
+        sets = sets_to_fuse(frame.hr, frame.write)
+        if not sets:
+            return
+        session, beauty, decoded = frame.session, picture.rgb, (frame.renders.lr, frame.renders.hr)
+        session.release_memory()  # for the passes
+        if stored_type(frame.hr.beauty_channels, frame.write) == "half" and beauty.dtype != np.float16:
+            # The passes sum to the beauty that is written.
+            beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
+        with limit_threads(session.threads):
+            picture.passes = fuse_passes(
+                PassInputs(
+                    frame.lr, frame.hr, beauty, picture.alignment, sets, picture.clean_aovs, frame.means, decoded
+                ),
+                picture.replaced,
+                fuse_layers=layer_fuser(session, picture),
+                cache_bytes=strips_memory(self.settings.max_memory - frame.held_bytes, picture.nbytes),
+                progress=frame.progress,
+            )
+        picture.replaced = picture.passes.pixels
+        session.release_layer_memory()
 
     def _unplanned_views(self, first: ShotFrame) -> list[str]:
         """Return a sentence for each view that is fused frame by frame because the plan does not know it."""

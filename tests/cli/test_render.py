@@ -237,7 +237,7 @@ def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, 
     monkeypatch.setattr(read, "_read_pixels", lambda frame: loaded.append(load(frame) or frame))
     monkeypatch.setattr(memory, "_vector_bytes", lambda hr, channels: counted.append(channels) or counts(hr, channels))
     frames = [FrameFiles(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
-    shot = RenderedShot(Settings(model=str(bilinear_models[4])), frames, frames, TemporalOptions("auto"))
+    shot = RenderedShot(Settings(model=str(bilinear_models[4])), 4, frames, frames, TemporalOptions("auto"))
     for frame in shot.order:
         pair = [moving / f"{render}/{render}.{frame.number}.exr" for render in ("lr", "hr")]
         shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))

@@ -46,7 +46,7 @@ def _grey(values: Array) -> Array:
 def display() -> Scene:
     """Return a screen that shows lines of several widths, before a dim wall."""
     lit = (np.floor(X / (1 + np.floor(Y / 32))) % 2 == 1) & (X > 40) & (X < 216)
-    return Scene(surface(SHAPE, ambient=0.05, emission=_grey(0.9 * lit) * np.float32((0.3, 0.9, 1.0))))
+    return Scene(surface(SHAPE, ambient=0.05, emission=_grey(0.9 * lit) * np.array((0.3, 0.9, 1.0), np.float32)))
 
 
 def leather() -> Scene:
@@ -67,7 +67,7 @@ def flakes() -> Scene:
     rng = np.random.default_rng(8)
     glints = np.where(rng.random(SHAPE) < 0.02, rng.exponential(4, SHAPE), 0.05)
     spot = np.exp(-((X - 128) ** 2 + (Y - 110) ** 2) / 2 / 55**2)
-    emission = _grey(glints * spot) * np.float32((0.9, 0.15, 0.1))
+    emission = _grey(glints * spot) * np.array((0.9, 0.15, 0.1), np.float32)
     return Scene(surface(SHAPE, albedo=_columns(0.5, 0.05, 0.04), ambient=0.2, emission=emission))
 
 
@@ -82,7 +82,7 @@ def _points(count: int, size: int, brightest: float, seed: int) -> Array:
 
 def stars() -> Scene:
     """Return a night sky."""
-    sky = np.float32((0.001, 0.0014, 0.0025))
+    sky = np.array((0.001, 0.0014, 0.0025), np.float32)
     return Scene(surface(SHAPE, normal=_columns(0, 0, 0), emission=_points(700, 2, 60, 4) + sky))
 
 
@@ -95,7 +95,9 @@ def lamps() -> Scene:
 def blue_lamp() -> Scene:
     """Return a wall lit by a blue lamp alone, which luminance hardly sees."""
     wall = np.where((X // 32 + Y // 32) % 2 == 1, 0.6, 0.3)
-    return Scene(surface(SHAPE, albedo=_grey(wall) * np.float32((0, 0, 1)), direct=0.5, visible=0.6, ambient=0.1))
+    return Scene(
+        surface(SHAPE, albedo=_grey(wall) * np.array((0, 0, 1), np.float32), direct=0.5, visible=0.6, ambient=0.1)
+    )
 
 
 def painted_wall() -> Scene:

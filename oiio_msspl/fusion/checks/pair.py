@@ -295,7 +295,8 @@ def are_not_independent(hrls: HrlsAverages) -> bool:
     brightness, difference, expected = hrls.blocks[..., :6].sum(axis=-1) / 6, hrls.blocks[..., 6], hrls.blocks[..., 7]
     varied = expected * BLOCK**2 > np.square(NOISY * brightness)
     equal = varied & (difference * BLOCK**2 < np.square(EQUAL * brightness))
-    return np.count_nonzero(varied) >= MIN_NOISY_BLOCKS and 4 * np.count_nonzero(equal) > 3 * np.count_nonzero(varied)
+    count = int(np.count_nonzero(varied))
+    return count >= MIN_NOISY_BLOCKS and 4 * int(np.count_nonzero(equal)) > 3 * count
 
 
 def _has_same_noise(hrls: HrlsAverages) -> bool:

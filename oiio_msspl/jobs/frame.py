@@ -160,7 +160,9 @@ class ShotFrame:
             InputError: pixels can't be decoded.
         """
         if self.renders.hr is self.stored[1] and not is_large(self.hr):
-            self.renders = RenderPair(self.stored[0].load(), self.stored[1].load())
+            lr, hr = self.stored
+            high = hr.load()
+            self.renders = RenderPair(high if lr is hr else lr.load(), high)
         return self.renders
 
     def motion_frame(self) -> MotionFrame:

@@ -127,6 +127,9 @@ def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, La
     """Return the light of all layers of LRHS and HRLS."""
     # A large frame is read in strips if no network needs whole layers, and the strips that are compared twice.
     decode = inputs.averaged is None and (by_network or not is_large(inputs.hr))
+    if inputs.lr is inputs.hr:
+        light = light_of(inputs.hr, layer_names(inputs.sets), decode=decode)
+        return light, light
     return in_parallel(
         partial(light_of, inputs.lr, lrhs_names(inputs.lr, inputs.sets), decode=decode),
         partial(light_of, inputs.hr, layer_names(inputs.sets), decode=decode),

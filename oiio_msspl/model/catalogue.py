@@ -30,17 +30,18 @@ def shipped_models() -> dict[str, Path]:
 
 
 def digest(path: Path) -> str:
-    """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the weights files it names.
+    """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the files whose weights it reads.
 
     Args:
-        path: the ONNX file. Its weights files, ``*.weights``, lie beside it and are read in the order of their names.
+        path: the ONNX file. The other files, ``*.weights`` or models at x2, lie beside it and are read in the order of
+            their names.
 
     Raises:
         FileNotFoundError: the ONNX file or one of its weights files is missing.
     """
     content = path.read_bytes()
     made = hashlib.sha256(content)
-    for name in sorted(set(re.findall(rb"[\w.-]+\.weights", content))):
+    for name in sorted(set(re.findall(rb"[\w.-]+\.weights|[\w-]+-x2\.onnx", content))):
         made.update((path.parent / name.decode()).read_bytes())
     return made.hexdigest()[:12]
 

@@ -23,6 +23,7 @@ import numpy as np
 import onnx
 import torch
 from onnx import TensorProto, helper
+from onnx.external_data_helper import set_external_data
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -34,7 +35,7 @@ from research.training.ops import box_downsample
 from research.training.quantise.graph import Nodes
 from research.training.render_mean import NOISE_GAIN, Images, mean_of_renders
 from research.training.tracing import traced
-from research.training.whole_model import ENTER, SMALL, Enter, encoded, example, share_weights
+from research.training.whole_model import ENTER, SMALL, Enter, encoded, example
 
 #: What comes out of :class:`EnterHalves` and :class:`EnterWhole`; ``encoded.`` precedes these names in the graph.
 ENTERED = ("lrhs", "hrls", "colour", "noise", "albedo", "normal")
@@ -116,7 +117,20 @@ def same_size_model(path: Path, *, first_stage: bool = False) -> onnx.ModelProto
     ]
     model.graph.CopyFrom(helper.make_graph(nodes, contract.name, values, outputs, tensors))
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+    refer_to_weights(model, path)
     return model
+
+
+def refer_to_weights(model: onnx.ModelProto, path: Path) -> None:
+    """Let a model read the 8-bit weights that lie in the file of another model from there."""
+    content = path.read_bytes()
+    for tensor in model.graph.initializer:
+        # Numbers of several bytes may lie at any place in the file, and not all processors can read them there.
+        is_kept = len(tensor.raw_data) < SMALL or tensor.data_type not in (TensorProto.INT8, TensorProto.UINT8)
+        place = -1 if is_kept else content.find(tensor.raw_data)
+        if place >= 0:
+            set_external_data(tensor, path.name, place, len(tensor.raw_data))
+            tensor.ClearField("raw_data")
 
 
 def _first_stage(
@@ -164,20 +178,11 @@ def main() -> None:
     parser.add_argument("--first-stage", action="store_true", help="only denoise the mean of both renders")
     args = parser.parse_args()
     for source in filter(None, (args.model, gpu_file(args.model))):
-        _move_weights(source)
         model = same_size_model(source, first_stage=args.first_stage)
         file = source.with_name(f"{model.graph.name}.onnx")
         onnx.save(model, file)
         onnx.checker.check_model(file, full_check=True)
         print(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
-
-
-def _move_weights(path: Path) -> None:
-    """Move the weights that are in a file to one beside it, which other models can share."""
-    model = onnx.load(path, load_external_data=False)
-    if any(len(tensor.raw_data) >= SMALL for tensor in model.graph.initializer):
-        share_weights([model], path.with_suffix(".weights"))
-        onnx.save(model, path)
 
 
 if __name__ == "__main__":

@@ -34,8 +34,8 @@ def test_weights_that_models_share_lie_beside_them(name):
     expected = set() if name.startswith("paper") else {f"mean_denoiser{small}{noise}.weights"}
     if name.startswith("joint-large"):
         expected.add(f"joint-large{noise.replace('_', '-')}.weights")
-    if name.startswith("joint") and scale in "12":
-        expected.add(f"{family}-x2.weights")
+    elif name.startswith("joint") and scale == "1":
+        expected.add(f"{family}-x2.onnx")
     assert files == expected
     assert all((WEIGHTS / file).is_file() for file in files)
 

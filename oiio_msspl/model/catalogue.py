@@ -30,7 +30,7 @@ def shipped_models() -> dict[str, Path]:
 
 
 def digest(path: Path) -> str:
-    """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the files whose weights it reads.
+    """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the weights that it reads.
 
     Args:
         path: the ONNX file. The other files, ``*.weights`` or models at x2, lie beside it and are read in the order of

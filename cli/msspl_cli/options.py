@@ -42,10 +42,11 @@ def _show_all(context: typer.Context, wanted: bool) -> None:
         raise typer.Exit
 
 
-_LR = "Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr."
-LowRender = Annotated[Path, typer.Argument(metavar="LR", help=_LR, show_default=False)]
-_HR = "High-resolution, low-spp render, in the same form."
-HighRender = Annotated[Path, typer.Argument(metavar="HR", help=_HR, show_default=False)]
+_RENDERS = (
+    "One render, or two of the same frame: a low-resolution, high-spp render LR and a high-resolution, low-spp render "
+    "HR, or two of the same size. Each is an EXR. For a shot: a folder, or a pattern such as hr.####.exr."
+)
+Renders = Annotated[list[Path], typer.Argument(metavar="[LR] HR", help=_RENDERS, show_default=False)]
 
 _MAP = (
     "Read a feature (rgb, albedo or normal; for the model paper also diffuse, specular or variance) from this layer, "
@@ -154,6 +155,17 @@ def make_inputs(
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
     mapped = layers | parse_map_options(mapping)
     return InputOptions(mapped, view_layer, lr_spp, hr_spp, colourspace, tuple(sums or ()), map_file)
+
+
+def low_and_high(renders: list[Path]) -> tuple[Path | None, Path]:
+    """Return the paths of the LRHS and of the HRLS; None and that of the only render.
+
+    Raises:
+        InputError: there are more than two.
+    """
+    if len(renders) > 2:
+        raise InputError(f"{renders[2]}: is a third render; give one, or two of the same frame")
+    return renders[0] if len(renders) == 2 else None, renders[-1]
 
 
 def choose_model(model: str, quality: str | None) -> str:

@@ -133,7 +133,7 @@ def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list
     """
     for frame in frames:
         if frame.lr is not None and frame.hr is not None:
-            check = check_files(frame.lr, frame.hr, inputs)
+            check = check_files(None if frame.lr == frame.hr else frame.lr, frame.hr, inputs)
             problems = [f"can't be checked here: {check.problem}"] if check.problem else []
             return [f"frame {frame.number}: {text}" for text in [*problems, *check.warnings, *check.passed_on]]
     return []

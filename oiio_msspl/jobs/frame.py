@@ -161,8 +161,9 @@ class ShotFrame:
         """
         if self.renders.hr is self.stored[1] and not is_large(self.hr):
             sets = sets_to_fuse(self.hr, self.write)
-            lr, hr = with_light(self.lr, lrhs_names(self.lr, sets)), with_light(self.hr, layer_names(sets))
-            self.renders = RenderPair(*(render.load([*render.features, "alpha"]) for render in (lr, hr)))
+            high = _loaded(with_light(self.hr, layer_names(sets)))
+            low = high if self.lr is self.hr else _loaded(with_light(self.lr, lrhs_names(self.lr, sets)))
+            self.renders = RenderPair(low, high)
         return self.renders
 
     def motion_frame(self) -> MotionFrame:
@@ -187,3 +188,8 @@ class ShotFrame:
         self.means = self.frame_counts = None
         if self.fused is not None:
             self.fused = replace(self.fused, clean_aovs={}, error=None, frames=None)
+
+
+def _loaded(render: MappedRender) -> Render:
+    """Read the features of a render, with its alpha."""
+    return render.load([*render.features, "alpha"])

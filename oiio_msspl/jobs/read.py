@@ -150,5 +150,6 @@ def _read_pixels(frame: ShotFrame) -> None:
         high, stored = memory.hr.load_with(channels, memory.features, on_disk=memory.on_disk)
         vectors = motion.vectors_of(frame.hr, high, stored) if motion and channels else {}
         frame.vectors = {direction: (kept(pixels), kept(mask)) for direction, (pixels, mask) in vectors.items()}
-        frame.renders = RenderPair(memory.lr.load(memory.features, on_disk=memory.on_disk), high)
+        low = high if memory.lr is memory.hr else memory.lr.load(memory.features, on_disk=memory.on_disk)
+        frame.renders = RenderPair(low, high)
     frame.seconds["read"] = time.perf_counter() - start

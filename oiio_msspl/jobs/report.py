@@ -18,7 +18,7 @@ from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.layers import layer_by_channel, layers_of
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.contract import ONE_SIZE, Contract
 from oiio_msspl.model.session import Session
 
 #: Samples of the LRHS below which a pair gets a warning, as a share of those of the HRLS, both per pixel of the frame.
@@ -72,10 +72,15 @@ class FrameReport:
     In a file with views (``left``) they are ``VIEW: LAYER``."""
 
     @property
+    def is_one_render(self) -> bool:
+        """Whether the frame has one render, which is both ``lr`` and ``hr``."""
+        return self.lr.file is self.hr.file
+
+    @property
     def spp_avg(self) -> float | None:
         """Average samples: spp_LRHS / s^2 + spp_HRLS (section 5.1), or None if a header does not say."""
-        if self.lr.spp is None or self.hr.spp is None:
-            return None
+        if self.lr.spp is None or self.hr.spp is None or self.is_one_render:
+            return self.hr.spp if self.is_one_render else None
         return self.lr.spp / self.scale**2 + self.hr.spp
 
     def aovs(self) -> list[dict[str, str]]:
@@ -94,12 +99,13 @@ class FrameReport:
 
     def found_lrhs_aovs(self) -> dict[str, str]:
         """Return the features of ``lrhs_aovs`` that the LRHS has, with their layers."""
-        return {name: self.lr.features[name].text for name in self.lrhs_aovs if name in self.lr.features}
+        names = () if self.is_one_render else self.lrhs_aovs
+        return {name: self.lr.features[name].text for name in names if name in self.lr.features}
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values."""
         return {
-            "lrhs": self.lr.name,
+            "lrhs": None if self.is_one_render else self.lr.name,
             "hrls": self.hr.name,
             "output": str(self.output),
             "preview": str(self.preview) if self.preview else None,
@@ -108,7 +114,7 @@ class FrameReport:
             "other_views": self.hr.other_views,
             "fused_views": [{"view": view.hr.view or None, "aovs": view.aovs()} for view in self.fused_views()],
             "scale": self.scale,
-            "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
+            "spp": {"lrhs": None if self.is_one_render else self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
             "provider": self.provider,
             "convolutions": self.convolutions,
@@ -202,6 +208,8 @@ def _passes(fused: FusedFrame) -> dict[str, str]:
 
 def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:
     """Warn of samples per pixel that the method or the model was not made for."""
+    if contract.scale == ONE_SIZE:
+        return []
     warnings = []
     if lr.spp is not None and hr.spp is not None and lr.spp / contract.scale**2 < LEAST_SHARE * hr.spp:
         warnings.append(
@@ -235,19 +243,22 @@ def provenance(report: FrameReport) -> dict[str, str]:
     sum of the layers, and of the products of light and colour, is the fused beauty. The names are those of the HRLS.
     """
     views = {"msspl/views": ", ".join(name_of(view.hr.view) for view in report.fused_views())}
-    return (views if report.other_views else {}) | {
-        "msspl/version": __version__,
-        "msspl/model": report.model,
-        "msspl/scale": str(report.scale),
-        "msspl/lrhs": report.lr.name,
-        "msspl/hrls": report.hr.name,
-        "msspl/spp_lrhs": _spp(report.lr.spp),
-        "msspl/spp_hrls": _spp(report.hr.spp),
-        "msspl/spp_average": _spp(report.spp_avg),
-        "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
-        "msspl/trust": "off" if report.trust is None else f"{report.trust:.4f}",
-        "msspl/passes": json.dumps(_fused_layers(report)),
-    }
+    second = {} if report.is_one_render else {"msspl/lrhs": report.lr.name, "msspl/spp_lrhs": _spp(report.lr.spp)}
+    return (
+        (views if report.other_views else {})
+        | second
+        | {
+            "msspl/version": __version__,
+            "msspl/model": report.model,
+            "msspl/scale": str(report.scale),
+            "msspl/hrls": report.hr.name,
+            "msspl/spp_hrls": _spp(report.hr.spp),
+            "msspl/spp_average": _spp(report.spp_avg),
+            "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
+            "msspl/trust": "off" if report.trust is None else f"{report.trust:.4f}",
+            "msspl/passes": json.dumps(_fused_layers(report)),
+        }
+    )
 
 
 def _spp(spp: float | None) -> str:

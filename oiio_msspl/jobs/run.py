@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, is_light_of_pass
+from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import stored_type
@@ -45,6 +46,7 @@ from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key
 from oiio_msspl.jobs.views import store_view
+from oiio_msspl.model.contract import ONE_SIZE
 
 
 class ShotRun:
@@ -177,6 +179,7 @@ class ShotRun:
             trust=frame.write.trust,
             clean_aovs=uses_clean_aovs(frame.hr, frame.write),
             half=half,
+            share=_share_by_spp(frame.lr, frame.hr),
             max_memory=self.settings.max_memory,
             held=frame.held_bytes,
             progress=frame.progress,
@@ -313,7 +316,15 @@ def _replace_by_means(frame: ShotFrame, before: Sequence[Hop[RenderPair]], after
     frame.averaged = RenderPair(lr, hr)
     if passes:
         on_disk = is_large(frame.hr)
-        frame.means = _kept(lr, on_disk=on_disk), _kept(hr, on_disk=on_disk)
+        high = _kept(hr, on_disk=on_disk)
+        frame.means = high if lr is hr else _kept(lr, on_disk=on_disk), high
+
+
+def _share_by_spp(lr: MappedRender, hr: MappedRender) -> float | None:
+    """Return the share of the first of two renders of one size in their mean; None for other pairs, or unknown spp."""
+    if lr.spp is None or hr.spp is None or align(lr, hr).scale != ONE_SIZE:
+        return None
+    return lr.spp / (lr.spp + hr.spp)
 
 
 def _kept(render: Render, *, on_disk: bool) -> Render:

@@ -26,7 +26,14 @@ if TYPE_CHECKING:
 
     from oiio_msspl.jobs.report import FrameReport
 
+#: LRHS, HRLS and output; None and the only render in front, if there is one.
+Files = tuple[Path | None, Path, Path]
+
 EXAMPLES = """[bold]Examples[/bold]
+
+  msspl-fuse hr.exr -o out.exr
+
+  msspl-fuse seed1.exr seed2.exr -o out.exr
 
   msspl-fuse lr.exr hr.exr -o out.exr
 
@@ -60,8 +67,7 @@ _COMPRESSION = "Compress the fused layer by zip, zips, piz, dwaa, ... \\[default
 
 
 def fuse(
-    lr: options.LowRender,
-    hr: options.HighRender,
+    renders: options.Renders,
     *,
     # Input
     mapping: options.Map = [],  # noqa: B006
@@ -124,11 +130,14 @@ def fuse(
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
 ) -> None:
-    """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
+    """Remove the noise of a render, or of two renders of the same frame together.
+
+    Two renders have a noise seed each. They are a low-resolution, high-spp render
+    LR and a high-resolution, low-spp render HR, or two renders of the same size.
 
     OUT gets the fused beauty and passes, and every other layer of HR unchanged.
-    The scale (x2, x4, x8) follows from the two display windows. Layers are found
-    under the names that renderers give them; --map names others.
+    The scale (x1, x2, x4, x8) follows from the two display windows. Layers are
+    found under the names that renderers give them; --map names others.
 
     With folders or patterns it fuses a shot: frames are paired by number, and a
     bad frame does not stop the others.
@@ -138,7 +147,8 @@ def fuse(
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import check_exists, is_sequence
 
-    for path in (lr, hr):
+    lr, hr = options.low_and_high(renders)
+    for path in renders:
         check_exists(path)
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
@@ -154,7 +164,7 @@ def fuse(
     }
     over_time = TemporalOptions(temporal, motion_format)
     use_threads(threads)
-    if is_sequence(lr) or is_sequence(hr):
+    if any(is_sequence(path) for path in renders):
         if debug:
             logging.getLogger("oiio_msspl.jobs.shot").setLevel(logging.DEBUG)  # the traceback of each failed frame
         printer = ShotPrinter(verbose, quiet, as_json, progress)
@@ -178,7 +188,7 @@ def fuse(
     _fuse_pair((lr, hr, output), verbose, quiet, as_json, preview_path=png, **common)
 
 
-def _fuse_shot(files: tuple[Path, Path, Path], scheduler: str | None, printer: ShotPrinter, **settings: Any) -> None:
+def _fuse_shot(files: Files, scheduler: str | None, printer: ShotPrinter, **settings: Any) -> None:
     """Fuse a shot, on a Dask cluster if ``--scheduler`` names one, and exit with its code."""
     from oiio_msspl.jobs.shot import fuse_shot
 
@@ -195,7 +205,7 @@ def _fuse_shot(files: tuple[Path, Path, Path], scheduler: str | None, printer: S
     raise typer.Exit(report.exit_code)
 
 
-def _fuse_pair(files: tuple[Path, Path, Path], verbose: int, quiet: bool, as_json: bool, **settings: Any) -> None:
+def _fuse_pair(files: Files, verbose: int, quiet: bool, as_json: bool, **settings: Any) -> None:
     """Fuse a single frame, and print its report."""
     from oiio_msspl.jobs.files import fuse_files
 
@@ -219,7 +229,8 @@ def _print(report: FrameReport, seconds: float) -> None:
     """Print which layers were used, what was repaired, and the time of each stage."""
     from oiio_msspl.aovs.views import name_of
 
-    renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
+    kind = "render" if report.is_one_render else "pair"
+    renderer = kind.capitalize() if report.hr.renderer == "unknown" else f"{report.hr.renderer} {kind}"
     average = "" if report.spp_avg is None else f", {report.spp_avg:g} spp on average"
     fused = [name_of(view.hr.view) for view in report.fused_views()]
     rest = [name for name in map(name_of, report.hr.other_views) if name not in fused]

@@ -130,6 +130,9 @@ def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, La
     # A large frame is read in strips if no network needs whole layers, and the strips that are compared twice.
     decode = inputs.averaged is None and (by_network or not is_large(inputs.hr))
     low, high = inputs.decoded or (None, None)
+    if inputs.lr is inputs.hr:
+        light = light_of(inputs.hr, layer_names(inputs.sets), decode=decode, decoded=high)
+        return light, light
     return in_parallel(
         partial(light_of, inputs.lr, lrhs_names(inputs.lr, inputs.sets), decode=decode, decoded=low),
         partial(light_of, inputs.hr, layer_names(inputs.sets), decode=decode, decoded=high),

@@ -119,6 +119,9 @@ def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet
     """
     names = layer_names(sets)
     high = {names[layer]: layer.formula for additive_set in sets for layer in additive_set.layers}
+    if lr is hr:
+        render = replace(hr, features=hr.features | high)
+        return render, render
     low = {name: layer.formula for layer, name in lrhs_names(lr, sets).items()}
     return replace(lr, features=lr.features | low), replace(hr, features=hr.features | high)
 

@@ -11,27 +11,32 @@ are not taken for detail (Firmino et al. 2022, *Progressive Denoising of Monte C
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 
-from oiio_msspl.image.arrays import Array, planes_of
+from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import blurred, box_downsample, max_around, means_around, upsample_linear
 from oiio_msspl.image.parallel import for_row_blocks
 
 #: Reach of the windows in which energies are compared, in LRHS pixels, and the t that leaves no doubt. Large windows
 #: find faint detail, small ones find where it ends. They hold fewer pixels, but also fewer kinds of noise.
-WINDOWS = ((3, 4.0), (7, 5.0), (15, 5.0))
-#: The t below which a difference is taken for noise.
-DOUBTFUL = 3.0
+WINDOWS = ((3, 5.0), (7, 5.0), (15, 5.0))
 #: Exposed radiance that is added to the local brightness, so that dark noise does not count as much as light.
 DARKEST = 0.02
 #: Squared difference relative to the local brightness, and to s^2, that counts at most: a firefly is one pixel.
 LARGEST = 16.0
-#: A pixel is judged by itself where the mean amplitude around is this many times that of the noise: scattered points.
-#: It is also judged where its energy is this many times the largest noise around: a lamp alone.
-SPARSE, ALONE = 1.5, 16.0
+#: A pixel is judged by itself where the renders agree on this share of all brighter differences around: scattered
+#: points. Fireflies agree by chance alone. It is also judged where its energy is this many times the largest noise
+#: around: a lamp alone.
+AGREED, ALONE = (0.4, 0.7), 16.0
+#: Squared relative difference that is too small for a point, and amplitude without agreement that counts as well: a few
+#: dim points may agree by chance.
+POINT, DOUBT = 0.1, 4.0
+#: Share of the pixels of a window that are darker than the picture if light may be missing.
+MOSTLY = 0.6
 #: Noise counts this many times where a pixel is judged by itself.
 PIXEL = 4.0
 #: Error of a half float, relative to its value.
@@ -101,30 +106,58 @@ def _trust_in_detail(
     scale = renders.scale
     brightness = _brightness(box_downsample(fused.mean(axis=0), scale), renders.exposure)
     weight = np.divide(np.float32(1 / len(fused)), np.square(brightness), dtype=np.float32)
-    squares = reduce(np.add, (np.square(a - b) for a, b in zip(detailed, fused, strict=True)))
-    energy: Array = weight * box_downsample(squares, scale)
+    differences = detailed - fused
+    energy: Array = weight * box_downsample(np.square(differences).sum(axis=0), scale)
+    darker = box_downsample(differences.sum(axis=0), scale) < 0
     # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of
     # the mean of both renders is E d^2 share (1 - share).
     factor = np.float32(renders.share * (scale**2 if scale > 1 else 1 - renders.share))
     noise: Array = factor * weight * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
     windows = [(size, certain) for size, certain in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
-    sizes = [size for size, _ in windows]
     most = np.float32(LARGEST * scale**2)
-    e, v = np.minimum(energy, most), np.minimum(noise, most)
-    energies, noises, fourth_powers = (means_around(plane, sizes) for plane in (e, v, e * e + v * v))
+    areas = _trust_in_areas(np.minimum(energy, most), np.minimum(noise, most), darker, windows)
+    points = _trust_in_points(energy, noise, darker, most, windows[-1][0])
+    return np.maximum(areas, points), points
+
+
+def _trust_in_areas(energy: Array, noise: Array, darker: Mask, windows: Sequence[tuple[int, float]]) -> Array:
+    """Return how much of a difference is detail by the means of windows, (h, w) in [0, 1].
+
+    Args:
+        energy, noise: squared difference, and the part of it that noise explains.
+        darker: the renders are darker than the picture.
+        windows: see ``WINDOWS``.
+    """
+    sizes = [size for size, _ in windows]
+    energies, noises, squares = (means_around(x, sizes) for x in (energy, noise, np.square(energy) + np.square(noise)))
     trust = np.zeros_like(energy)
-    for window, mean, noise_mean, squared in zip(windows, energies, noises, fourth_powers, strict=True):
-        part = _certainty(mean - noise_mean, squared, *window) * _kept(mean, noise_mean)
+    for i, (share, window) in enumerate(zip(means_around(darker.astype(np.float32), sizes), windows, strict=True)):
+        # Most small windows lack rare light. So one that is darker has the noise of the largest one.
+        explained = np.where(share > MOSTLY, np.maximum(noises[i], noises[-1]), noises[i])
+        part = _certainty(energies[i] - explained, squares[i], *window) * _kept(energies[i], explained)
         np.maximum(trust, means_around(part, [window[0]])[0], out=trust)
-    amplitude = means_around(np.sqrt(e) - np.float32(SPARSE) * np.sqrt(v), sizes[-1:])[0]
-    scattered = _certainty(amplitude, energies[-1] + noises[-1], *windows[-1])
-    alone = _kept(energy, np.float32(ALONE) * max_around(noise, sizes[-1]))
-    points = np.maximum(scattered, alone) * _kept(energy, np.float32(PIXEL) * noise)
-    return np.maximum(trust, points), points
+    return trust
+
+
+def _trust_in_points(energy: Array, noise: Array, darker: Mask, most: np.float32, size: int) -> Array:
+    """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1].
+
+    Args:
+        energy, noise, darker: as for :func:`_trust_in_areas`.
+        most: values that count for their surroundings are limited to this.
+        size: reach of the window around.
+    """
+    light = np.where(darker, np.float32(0), energy)
+    kept, amplitude = _kept(light, np.float32(PIXEL) * noise), np.sqrt(np.clip(light - np.float32(POINT), 0, most))
+    agreed, total = (means_around(x, [size])[0] for x in (amplitude * kept, amplitude))
+    share = agreed / (total + np.float32(DOUBT / (2 * size + 1) ** 2))
+    scattered = np.clip((share - AGREED[0]) / (AGREED[1] - AGREED[0]), 0, 1)
+    alone = _kept(light, np.float32(ALONE) * max_around(noise, size))
+    return np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
 
 
 def _certainty(excess: Array, squares: Array, size: int, certain: float) -> Array:
-    """Return how certain it is that the mean of a window exceeds 0: from 0 at ``DOUBTFUL`` to 1 at ``certain``.
+    """Return how certain it is that the mean of a window exceeds 0: from 0 at ``certain`` - 2 to 1 at ``certain``.
 
     Args:
         excess: the mean.
@@ -133,7 +166,7 @@ def _certainty(excess: Array, squares: Array, size: int, certain: float) -> Arra
     """
     error = np.sqrt(np.maximum(squares, 0) / np.float32((2 * size + 1) ** 2))
     t = excess / np.maximum(error, np.float32(1e-12))
-    return np.clip((t - np.float32(DOUBTFUL)) / np.float32(certain - DOUBTFUL), 0, 1)
+    return np.clip((t - np.float32(certain - 2)) / np.float32(2), 0, 1)
 
 
 def _kept(energy: Array, noise: Array) -> Array:
@@ -206,10 +239,13 @@ def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:
     mean = high + share * (low - high)
     most = np.float32(LARGEST)
     product = np.clip(low * high, -most, most)
-    size = [LIGHT_REACH]
-    common, squares, energy = (means_around(plane, size)[0] for plane in (product, product * product, mean * mean))
+    near = [LIGHT_REACH]
+    squares, squares_far = means_around(product * product, [LIGHT_REACH, 4 * LIGHT_REACH])
+    common, energy = (means_around(plane, near)[0] for plane in (product, mean * mean))
+    # Most small windows lack rare light.
+    squares = np.where(mean < 0, np.maximum(squares, squares_far), squares)
     shrink = _certainty(common, squares, LIGHT_REACH, WINDOWS[-1][1]) * _kept(energy, energy - common)
-    return mean * means_around(shrink, size)[0] + coarser
+    return mean * means_around(shrink, near)[0] + coarser
 
 
 def _enlarge(half: Array, height: int, width: int) -> Array:

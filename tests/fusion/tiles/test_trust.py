@@ -131,3 +131,19 @@ def test_black_renders_stay_black() -> None:
     black = np.zeros((64, 64, 3), np.float32)
     result, trust = trust_renders(black, Renders(black[::2, ::2], black, 0.5, 1.0), REACH)
     assert not result.any() and not trust.any()
+
+
+@pytest.mark.parametrize("ambient", [0.0, 0.15])
+@pytest.mark.parametrize("scale", [1, 2])
+def test_light_that_few_samples_find_stays(scale: int, ambient: float) -> None:
+    truth, found = wall(), 0.004
+    rng = np.random.default_rng(1)
+
+    def render(side: int, spp: int) -> Array:
+        hits = rng.binomial(spp, found, (side, side)) / (spp * found)
+        return (ambient + (1 - ambient) * hits)[..., None].astype(np.float32)
+
+    lrhs = render(SIZE // scale, scale**2) * box_downsample(truth, scale)
+    result, _ = trust_renders(truth, Renders(lrhs, render(SIZE, 1) * truth, 0.5, 1.0), REACH)
+    assert rms(result, truth) < 0.05
+    assert result.min() > 0.5 * truth.min()

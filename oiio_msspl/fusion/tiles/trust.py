@@ -115,25 +115,30 @@ def _trust_in_detail(
     noise: Array = factor * weight * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
     windows = [(size, certain) for size, certain in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
     most = np.float32(LARGEST * scale**2)
-    areas = _trust_in_areas(np.minimum(energy, most), np.minimum(noise, most), darker, windows)
+    areas = _trust_in_areas(energy, noise, darker, most, windows)
     points = _trust_in_points(energy, noise, darker, most, windows[-1][0])
     return np.maximum(areas, points), points
 
 
-def _trust_in_areas(energy: Array, noise: Array, darker: Mask, windows: Sequence[tuple[int, float]]) -> Array:
+def _trust_in_areas(
+    energy: Array, noise: Array, darker: Mask, most: np.float32, windows: Sequence[tuple[int, float]]
+) -> Array:
     """Return how much of a difference is detail by the means of windows, (h, w) in [0, 1].
 
     Args:
         energy, noise: squared difference, and the part of it that noise explains.
         darker: the renders are darker than the picture.
+        most: values are limited to this.
         windows: see ``WINDOWS``.
     """
     sizes = [size for size, _ in windows]
+    # Most windows lack rare light, and the noise that it makes. So a window that is darker has the noise of all around.
+    noise_around = means_around(noise, sizes[-1:])[0]
+    energy, noise = np.minimum(energy, most), np.minimum(noise, most)
     energies, noises, squares = (means_around(x, sizes) for x in (energy, noise, np.square(energy) + np.square(noise)))
     trust = np.zeros_like(energy)
     for i, (share, window) in enumerate(zip(means_around(darker.astype(np.float32), sizes), windows, strict=True)):
-        # Most small windows lack rare light. So one that is darker has the noise of the largest one.
-        explained = np.where(share > MOSTLY, np.maximum(noises[i], noises[-1]), noises[i])
+        explained = np.where(share > MOSTLY, np.maximum(noises[i], noise_around), noises[i])
         part = _certainty(energies[i] - explained, squares[i], *window) * _kept(energies[i], explained)
         np.maximum(trust, means_around(part, [window[0]])[0], out=trust)
     return trust
@@ -238,12 +243,12 @@ def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:
         low, high = low - _enlarge(half_low, height, width), high - _enlarge(half_high, height, width)
     mean = high + share * (low - high)
     most = np.float32(LARGEST)
+    near, around = [LIGHT_REACH], [4 * LIGHT_REACH]
+    squares_around = means_around(np.square(low * high), around)[0]
     product = np.clip(low * high, -most, most)
-    near = [LIGHT_REACH]
-    squares, squares_far = means_around(product * product, [LIGHT_REACH, 4 * LIGHT_REACH])
-    common, energy = (means_around(plane, near)[0] for plane in (product, mean * mean))
-    # Most small windows lack rare light.
-    squares = np.where(mean < 0, np.maximum(squares, squares_far), squares)
+    common, squares, energy = (means_around(plane, near)[0] for plane in (product, product * product, mean * mean))
+    # Most windows lack rare light.
+    squares = np.where(mean < 0, np.maximum(squares, squares_around), squares)
     shrink = _certainty(common, squares, LIGHT_REACH, WINDOWS[-1][1]) * _kept(energy, energy - common)
     return mean * means_around(shrink, near)[0] + coarser
 

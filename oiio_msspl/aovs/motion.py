@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from oiio_msspl.aovs.renderers import renderers, view_layer_of
+from oiio_msspl.aovs.renderers import names_of_others, renderers, view_layer_of
 from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, same_spelling
@@ -103,6 +103,8 @@ class MotionLayers:
 
     fields: tuple[MotionField, ...] = ()
     """Motion vectors, in the order of the table."""
+    guesses: tuple[MotionField, ...] = ()
+    """Layers of two or three channels of which nothing is known: the pixels may tell that they are vectors."""
     position: tuple[Channel, ...] | None = None
     """World-space position of the surface, X, Y, Z."""
     depth: Channel | None = None
@@ -117,7 +119,9 @@ class MotionLayers:
         return (x, y) if x and y else None
 
 
-def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty) -> MotionLayers:
+def find_motion_layers(
+    renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, read: Collection[Channel] = ()
+) -> MotionLayers:
     """Find the layers of motion vectors, position and depth.
 
     The names that are common to all renderers are tried behind those of the renderer.
@@ -126,6 +130,7 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
         renderer: entry of the table.
         layers: of the file.
         beauty: the one that was chosen; its view and view layer are searched.
+        read: channels that hold something else.
     """
     named = {name: layer for name, layer in beauty.layers_of_view(layers) if name}
     common = renderers()[-1]
@@ -138,10 +143,19 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
     depths = [d[1] for alias in [*renderer.get("depth", ()), *common["depth"]] if (d := _named(named, alias))]
     # Of the layer without a name only Z can be a depth: R and Y are light.
     plain = [Layer("", "", {"Z": beauty.layer.channels["Z"]})] if "Z" in beauty.layer.channels else []
+    known = names_of_others(renderer)
+    unknown = [
+        name
+        for name, layer in named.items()
+        if len(layer.channels) in (2, 3)
+        and not any(view_layer_of(name, alias) is not None for alias in known)
+        and not set(read).intersection(layer.channels.values())
+    ]
     return MotionLayers(
         tuple(vectors.values()),
+        tuple(field for name in unknown for field in _fields(named, name, None, MotionFormat())),
         next((triple for _, layer in filter(None, positions) if (triple := layer.triple())), None),
-        next((layer.channels[c] for layer in [*depths, *plain] for c in "ZRVYT" if c in layer.channels), None),
+        next((channel for layer in [*depths, *plain] for channel in _depth_in(layer)), None),
         named,
     )
 
@@ -220,10 +234,14 @@ def _problem_of_word(key: str, equals: str, value: str) -> str:
 
 def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:
     """Return the layer that an alias means, and its short name."""
-    for name, layer in layers.items():
-        if view_layer_of(name, alias) == "" or same_spelling(name) == same_spelling(alias):
-            return name, layer
-    return None
+    meant = [name for name in layers if view_layer_of(name, alias) == "" or same_spelling(name) == same_spelling(alias)]
+    name = min(meant, key=lambda name: name != alias, default=None)
+    return None if name is None else (name, layers[name])
+
+
+def _depth_in(layer: Layer) -> list[Channel]:
+    """Return the channels of a layer of depth, best one first; 3Delight's only one is called 000."""
+    return [layer.channels[c] for c in "ZRVYT" if c in layer.channels] or [*(layer.scalar() or ())]
 
 
 def _fields(

@@ -21,7 +21,7 @@ from oiio_msspl.exr.reader import ExrFile
 #: The words of a file's or folder's name that mean the beauty, where every AOV has a file of its own.
 _BEAUTY_WORD = re.compile(r"(?<![^\W_])(beauty|rgba?|combined|main|c|ci|image)(?![^\W_])", re.IGNORECASE)
 #: The end of a file's stem from its frame number on.
-_FRAME_NUMBER = re.compile(r"[._ -]?-?\d*$")
+_FRAME_NUMBER = re.compile(r"([._ -]-?\d+)?$")
 
 
 @lru_cache(maxsize=1)

@@ -67,7 +67,9 @@ def only_colour(layers: list[Layer], other_names: Iterable[str]) -> list[str]:
         other_names: names and patterns of layers that are no beauty.
     """
     known = list(other_names)
-    colours = (layer for layer in layers if {"R", "G", "B"} <= layer.channels.keys() and layer.channels["R"].type != "uint")
+    colours = (
+        layer for layer in layers if {"R", "G", "B"} <= layer.channels.keys() and layer.channels["R"].type != "uint"
+    )
     names = {layer.name for layer in colours if all(view_layer_of(layer.name, name) is None for name in known)}
     return list(names) if len(names) == 1 else []
 
@@ -80,11 +82,11 @@ def find_alpha(layers: Iterable[Layer], beauty: Beauty) -> Channel | None:
     if "A" in beauty.layer.channels:
         return beauty.layer.channels["A"]
     beside = [layer for layer in layers if layer.view == beauty.view and not layer.triple()]
-    plain = next((layer for layer in beside if layer.name == beauty.view_layer and "A" in layer.channels), None)
-    alpha = next((layer for layer in beside if view_layer_of(layer.name, "alpha") == beauty.view_layer), None)
-    if plain:
-        return plain.channels["A"]
-    return alpha and (alpha.channels.get("A") or next(iter(alpha.scalar() or ()), None))
+    alphas = [layer.channels.get("A") for layer in beside if layer.name == beauty.view_layer]
+    for layer in beside:
+        if view_layer_of(layer.name, "alpha") == beauty.view_layer:
+            alphas += [layer.channels.get("A"), *(layer.scalar() or ())]
+    return next(filter(None, alphas), None)
 
 
 def choose_beauty(file: ExrFile, beauties: list[Beauty], wanted: str | None) -> Beauty:

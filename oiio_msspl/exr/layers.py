@@ -101,7 +101,11 @@ def _split_name(name: str, part: Part, views: list[str], *, several: bool) -> tu
         if words[place] and words[place] in (*views, part.view):
             view = words.pop(place)
             break
-    return view, ".".join(words) or (_part_layer(part) if several else ""), _COMPONENTS.get(component.lower(), component)
+    return (
+        view,
+        ".".join(words) or (_part_layer(part) if several else ""),
+        _COMPONENTS.get(component.lower(), component),
+    )
 
 
 def _part_layer(part: Part) -> str:

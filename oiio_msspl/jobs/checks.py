@@ -9,6 +9,8 @@ from pathlib import Path
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapping import split_exr
+from oiio_msspl.aovs.renderers import file_names
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, make_folder
 from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
@@ -21,7 +23,7 @@ from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.passes import check_passes
 from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
-from oiio_msspl.jobs.sequence import FrameFiles, Shot
+from oiio_msspl.jobs.sequence import FrameFiles, Shot, frame_in_name
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import family_of, for_spread_noise
@@ -33,12 +35,28 @@ def check_output(shot: Shot, inputs: InputOptions, model: str | None, more_targe
     """Check that the frames and ``more_targets`` can be written. The output folder may be missing.
 
     Raises:
-        InputError: the folder can't be written to, or a result would replace an input.
+        InputError: the folder can't be written to, a result would replace an input, or a mapping names one file of a
+            sequence.
     """
     folder = shot.output.folder
+    check_mapped_sequences(shot.frames, inputs)
     check_no_file(folder)
     check_folder(shot.output.path(0) if folder.exists() else folder)
     check_no_input(shot, inputs, model, more_targets)
+
+
+def check_mapped_sequences(frames: Sequence[FrameFiles], inputs: InputOptions) -> None:
+    """Raise InputError if a mapping names one file of a sequence for all frames of a shot."""
+    numbers = {frame.number for frame in frames}
+    for name in file_names(inputs.mapping):
+        path = Path(split_exr(name)[0])
+        if not path.is_file() or (numbered := frame_in_name(path)) is None:
+            continue
+        pattern = numbered[0]
+        if sum(pattern.path(number).is_file() for number in numbers) > 1:
+            raise InputError(
+                f"{path}: is one frame of a sequence, and would be read for all frames of the shot; write {pattern}"
+            )
 
 
 def make_output(shot: Shot) -> None:
@@ -142,6 +160,7 @@ def check_wanted_outputs(
             can't hold the layers, the model is for another scale or does not make a layer, or ``max_memory`` bytes are
             too few.
     """
+    check_mapped_sequences(frames, inputs)
     problem: InputError | None = None
     for frame in frames:
         if frame.lr is None or frame.hr is None:

@@ -104,6 +104,7 @@ class FrameReport:
             "view": self.hr.view or None,
             "other_views": self.hr.other_views,
             "fused_views": [{"view": view.hr.view or None, "aovs": view.aovs()} for view in self.fused_views()],
+            "size": self.hr.display_window.size,
             "scale": self.scale,
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,

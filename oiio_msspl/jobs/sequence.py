@@ -16,6 +16,7 @@ from pathlib import Path
 
 import fileseq
 
+from oiio_msspl.aovs.renderers import aov_files
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.model.contract import SCALES
@@ -331,8 +332,11 @@ def _sequences_in(folder: Path) -> list[Sequence]:
 
 
 def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> tuple[Sequence, Sequence]:
-    """Choose the two sequences that belong together: the only ones, or the only ones with equal names."""
-    pairs = [(low, high) for low in lows for high in highs]
+    """Choose the two sequences that belong together: the only ones, or the only ones with equal names.
+
+    Where each AOV has files of its own, those of the beauty count.
+    """
+    pairs = [(low, high) for low in _with_aovs(lows) for high in _with_aovs(highs)]
     if len(pairs) > 1:
         pairs = [(low, high) for low, high in pairs if low.pattern.base == high.pattern.base]
     if len(pairs) == 1:
@@ -350,6 +354,11 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
         f"which sequences belong together? {seen}, and {why}; "
         f"name the two, the low-resolution one first{_example(pairs or list(itertools.product(lows, highs)))}"
     )
+
+
+def _with_aovs(sequences: list[Sequence]) -> list[Sequence]:
+    """Return the sequences beside whose files lie files of albedo or normals; all if there are none."""
+    return [sequence for sequence in sequences if aov_files(next(iter(sequence.files.values())))] or sequences
 
 
 def _example(pairs: list[tuple[Sequence, Sequence]]) -> str:

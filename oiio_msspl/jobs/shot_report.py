@@ -19,7 +19,7 @@ from oiio_msspl.jobs.sequence import FrameFiles, Shot
 
 #: The keys that are read of ``first_fused`` in an earlier report. If a report of another version lacks some of them,
 #: frames are compared with the first one that this run fuses.
-FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "scale", "model", "aovs", "layers", "notes", "passes"}
+FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "size", "scale", "model", "aovs", "layers", "notes", "passes"}
 
 #: The most layers that a warning names.
 MOST_NAMES = 6
@@ -152,13 +152,14 @@ def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
 
 
 def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """Compare the features, the scale, the model and the number of neighbours."""
+    """Compare the features, the size, the scale, the model and the number of neighbours."""
     words = {"default": "not found", "absent": "not found"}
     before, now = (
         {row["feature"]: words.get(row["status"], row["status"]) for row in report["aovs"] if row["status"] != "unused"}
         for report in (first, here)
     )
     pairs = {feature: (now[feature], before[feature]) for feature in now if feature in before}
+    pairs["the frame"] = here["size"], first["size"]
     pairs["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
     if here["scale"] == first["scale"]:  # each scale has models of its own
         pairs["the model"] = here["model"], first["model"]

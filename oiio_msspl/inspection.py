@@ -194,6 +194,8 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
         if render.motion.fields:
             layers = " and ".join(f"{vectors.name} ({vectors.format})" for vectors in render.motion.fields)
             result.facts.append(f"motion: {layers} expected; the next frame beside this one would verify it")
+        elif guesses := ", ".join(field.name for field in render.motion.guesses):
+            result.facts.append(f"motion: {guesses} may hold vectors; the next frame beside this one would tell")
         return
     if motion_format:
         user_fields(render.motion, motion_format, render.name)

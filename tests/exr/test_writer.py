@@ -485,3 +485,12 @@ def test_an_alpha_of_integers_is_passed_on(tmp_path, layout):
     _, _, after = written(tmp_path, rgb(picture(H, W)) | {"A": ids}, WriteOptions(layout))
     (plane,) = [planes["A"] for _, planes in after if "A" in planes]
     assert same_bits(plane, ids)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_part_keeps_the_colour_space(tmp_path, layout):
+    """A part that is split into layers tells their space once, and programs read part by part."""
+    channels = rgb(picture(H, W)) | rgb(picture(H, W), "light_1.")
+    written(tmp_path, channels, WriteOptions(layout), colorInteropID="lin_ap1_scene")
+    with OpenEXR.File(str(tmp_path / "out.exr"), header_only=True) as out:
+        assert [part.header.get("colorInteropID") for part in out.parts] == ["lin_ap1_scene"] * len(out.parts)

@@ -248,3 +248,11 @@ def test_versions_in_a_folder_are_no_frames(tmp_path):
     touch(tmp_path / "lr", "rev1.exr")
     touch(tmp_path / "hr", "rev1.exr")
     assert list(find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out").hr.files) == [1]
+
+
+def test_where_aovs_have_files_of_their_own_the_beauty_is_paired(tmp_path):
+    names = [f"shot_{word}.{n}.exr" for word in ("beauty", "albedo", "depth") for n in (1, 2)]
+    touch(tmp_path / "lr", *names)
+    touch(tmp_path / "hr", *names)
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert (found.lr.pattern.name, found.hr.pattern.name) == ("shot_beauty.#.exr",) * 2

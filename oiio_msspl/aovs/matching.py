@@ -86,7 +86,8 @@ def map_render(
             formulas[feature] = _user_formula(finder, feature, mapping[feature], file)
             continue
         candidates = (finder.formula(feature, candidate, notes) for candidate in candidates_of(renderer, feature))
-        if (formula := next(filter(None, candidates), None)) is not None:
+        usable = (found for found in candidates if found and not _holds_integers(feature, found, notes))
+        if (formula := next(usable, None)) is not None:
             formulas[feature] = formula
     _check_no_integers(formulas)
     alpha = find_alpha(layers, beauty)
@@ -169,6 +170,14 @@ def _user_formula(finder: LayerFinder, feature: str, candidate: Any, file: ExrFi
     if formula is None:
         raise InputError(f"{file.path}: {problems[0] if problems else missing(feature, candidate, file)}")
     return formula
+
+
+def _holds_integers(feature: str, formula: FeatureFormula, notes: list[str]) -> bool:
+    """Return whether a layer that is found by its name can't be the feature, and note it."""
+    integers = [channel for channel in formula.channels if channel.type == "uint"]
+    if integers:
+        notes.append(f"{feature}: {formula.text} holds integers (ids, not light), so it is not read")
+    return bool(integers)
 
 
 def _check_no_integers(formulas: dict[str, FeatureFormula]) -> None:

@@ -111,13 +111,18 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
 def check_no_input(
     shot: Shot, inputs: InputOptions, model: str | None = None, more_targets: Iterable[Path] = ()
 ) -> None:
-    """Raise InputError if a file that is written is one of the shot's inputs, or is written twice.
+    """Raise InputError if a file that is written is one of the shot's inputs, is written twice, or lies among the LRHS.
+
+    The next run would take results in the LRHS's folder for renders.
 
     All files of both sequences are inputs, whichever frames are to be fused: neighbours and the plan over time are read
     from other frames, and no run may replace the render of a frame.
     """
     pairs = {*shot.lr.files.values(), *shot.hr.files.values()}
     others = [inputs.files(path, model) for path in shot.hr.files.values()]
+    folder, low = shot.output.folder, shot.lr.pattern.folder
+    if shot.output.number is shot.hr.pattern.number and folder.is_dir() and folder.samefile(low):
+        raise InputError(f"{folder}: holds the low-resolution renders; name another folder for the results")
     check_separate(pairs.union(*others), [*(path for frame in shot.frames for path in frame.targets), *more_targets])
 
 

@@ -115,7 +115,10 @@ def fuse_shot(
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
     make_output(shot)
     running = _RunningReport(report, path, progress, start)
-    to_fuse = running.add_known(ExistingResults(settings, plan), earlier)
+    existing = ExistingResults(settings, plan)
+    if odd := existing.dated_in_future(shot.frames):
+        log.warning("%s: is dated in the future, so --update can't tell what is newer; set its date (touch)", odd)
+    to_fuse = running.add_known(existing, earlier)
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model))

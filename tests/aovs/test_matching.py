@@ -18,6 +18,15 @@ def test_integers_are_no_light(tmp_path):
         mapped(tmp_path, ids)
 
 
+def test_an_aov_of_integers_does_not_refuse_the_frame(tmp_path):
+    """Another layer is read in its place, if there is one."""
+    channels = layer("", 1) | {f"albedo.{c}": np.full((H, W), 4000, np.uint32) for c in "RGB"}
+    render = mapped(tmp_path, channels)
+    assert sources(render) == {"rgb": "R G B"}
+    assert render.notes == ["albedo: albedo holds integers (ids, not light), so it is not read"]
+    assert sources(mapped(tmp_path, channels | layer("basecolor", 2)))["albedo"] == "basecolor"
+
+
 def test_an_alpha_of_integers_is_none(tmp_path):
     render = mapped(tmp_path, layer("", 1) | {"A": np.ones((H, W), np.uint32)})
     assert render.alpha is None and [c.name for c in render.beauty_channels] == ["R", "G", "B"]

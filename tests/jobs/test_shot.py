@@ -816,3 +816,23 @@ def test_a_report_of_another_version_does_not_stop_a_resumed_shot(tmp_path):
     path.write_text(json.dumps({"frames": [], "first_fused": "1001"}))
     with pytest.raises(InputError, match="is no report of a shot"):
         read_earlier(report, path, overwrite=False, skip_existing=True)
+
+
+def test_update_says_that_a_date_lies_in_the_future(tmp_path, bilinear_models, caplog):
+    """Such a frame is fused by every run, and nobody would see why."""
+    folder = make_shot(tmp_path, 2)
+    run(folder, bilinear_models[4])
+    run(folder, bilinear_models[4], update=True)
+    assert "future" not in caplog.text
+    late = folder / "hr/beauty.1002.exr"
+    os.utime(late, (late.stat().st_mtime + 5000,) * 2)
+    run(folder, bilinear_models[4], update=True)
+    assert f"{late}: is dated in the future, so --update can't tell what is newer" in caplog.text
+
+
+def test_results_do_not_lie_among_the_low_resolution_renders(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 1)
+    with pytest.raises(InputError, match="lr: holds the low-resolution renders; name another folder"):
+        fuse_shot(folder / "lr", folder / "hr", folder / "lr", model=str(bilinear_models[4]))
+    report = fuse_shot(folder / "lr", folder / "hr", folder / "lr" / "out.####.exr", model=str(bilinear_models[4]))
+    assert report.exit_code == 0

@@ -38,9 +38,12 @@ _PATHS = ("lr", "hr", "output", "map_file")
 def submit(
     context: typer.Context,
     bundle: Annotated[Path, typer.Option(metavar="DIR", help="Write to this new folder.", show_default=False)],
-    chunk: Annotated[int, typer.Option(metavar="N", min=1, help="Fuse N frames in each task.")] = 10,
+    chunk: Annotated[int, typer.Option(metavar="N", min=1, max=100_000, help="Fuse N frames in each task.")] = 10,
     timeout: Annotated[
-        int, typer.Option(metavar="SECONDS", min=1, help="Limit the time of a frame. A task gets N times as long.")
+        int,
+        typer.Option(
+            metavar="SECONDS", min=1, max=1_000_000, help="Limit the time of a frame. A task gets N times as long."
+        ),
     ] = 1800,
     # Typer splits a short option that it does not know into letters: in -o/path it would find the -h of --help.
     output: Annotated[str | None, typer.Option("--output", "-o", metavar="OUT", hidden=True)] = None,

@@ -95,7 +95,7 @@ def write_fused(
             write_single_part(temporary, contents)
         else:
             _write_parts(temporary, contents, cache_bytes)
-        _check_whole(temporary, path)
+        _check_whole(temporary, path, contents.compression)
     return warnings
 
 
@@ -174,16 +174,22 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
         raise not_written(path.parent, reason_of(writer) if writer.has_error else "no reason given")
 
 
-def _check_whole(temporary: Path, path: Path) -> None:
-    """Read the first and last row of every part: OpenImageIO does not tell if a full disk cut off the file's end."""
+def _check_whole(temporary: Path, path: Path, compression: str) -> None:
+    """Read the first and last row of every part: OpenImageIO does not tell if a full disk cut off the file's end.
+
+    Nor does it tell that it lacks a compression, and writes zip.
+    """
     try:
         with closing(open_exr(temporary)) as file:
+            written = file.parts[0].compression
             for part in file.parts:
                 window = part.data_window
                 for y in (window.y0, window.y1 - 1):
                     file.read(part.channels[:1], Window(window.x0, y, window.x1, y + 1))
     except InputError as error:
         raise not_written(path.parent, "its end is missing") from error
+    if written != compression:
+        raise InputError(f"--compression {compression}: this OpenImageIO writes {written} instead; name another one")
 
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:

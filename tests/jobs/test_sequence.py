@@ -235,7 +235,9 @@ def test_the_frame_number_in_a_name_is_no_version(tmp_path, name, following):
 
 def test_a_number_in_the_name_of_a_new_folder_is_explained(tmp_path):
     touch(tmp_path, "lr.1.exr", "hr.1.exr")
-    with pytest.raises(InputError, match=r"take##2: ## stands for the frame number, and the results are EXRs; name them"):
+    with pytest.raises(
+        InputError, match=r"take##2: ## stands for the frame number, and the results are EXRs; name them"
+    ):
         find_shot(tmp_path / "lr.#.exr", tmp_path / "hr.#.exr", tmp_path / "take##2")
 
 

@@ -56,7 +56,7 @@ _LAYERS = (
     "Write only these layers of HR (crypto*) beside the beauty, or none. A pass that does not match is left out, too. "
     "May be repeated. \\[default: all]"
 )
-_COMPRESSION = "Compress the fused layer by zip, zips, piz, dwaa, ... \\[default: as HR]"
+_COMPRESSION = "Compress the fused layer by zip, htj2k256, dwaa, ... \\[default: as HR, or zip if that is lossy]"
 
 
 def fuse(

@@ -18,6 +18,7 @@ from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.memory import memory_to_write
 from oiio_msspl.jobs.model_choice import choose_model
+from oiio_msspl.jobs.passes import WHOLE
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.run import ShotRun
@@ -57,7 +58,7 @@ def fuse_files(
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
-        progress: called with (steps done, steps in all). A step is a tile, or a band of rows of a set of passes.
+        progress: called with (thousandths done, 1000) of the whole work, from reading to writing.
 
     Returns:
         What was read, fused and written.
@@ -80,6 +81,8 @@ def fuse_files(
             check_view(view_transform)
     settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite)
     files = FrameFiles(0, Path(lr_path), Path(hr_path), output, preview_path)
+    if progress is not None:
+        progress(0, WHOLE)
     run = ShotRun(settings, ShotPlan(), [files], only_frame=True, tell=progress)
     views = run.read(files)
     frame = views[0]
@@ -97,4 +100,6 @@ def fuse_files(
     frame.report.seconds |= {"read": opened - start, "fuse": time.perf_counter() - opened}
     with limit_threads(threads):
         write_settled(frame, run.existing, only_frame=True)
+    if frame.progress is not None:
+        frame.progress.end()
     return frame.report

@@ -200,11 +200,11 @@ def _fuse_pair(files: tuple[Path, Path, Path], verbose: int, quiet: bool, as_jso
     start = time.perf_counter()
     with console.ProgressBar(shown=not quiet and not verbose) as bar:
 
-        def show_tile(done: int, count: int) -> None:
-            logging.info("step %d of %d", done, count)
+        def show(done: int, count: int) -> None:
+            logging.info("step %d of %d", done, count)  # hosts read this line
             bar.update("fusing", done, count)
 
-        report = fuse_files(*files, progress=show_tile, **settings)
+        report = fuse_files(*files, progress=show, **settings)
     if as_json:
         print(json.dumps(report.as_dict(), indent=2))
     elif not quiet:

@@ -156,16 +156,20 @@ def render(
     atomic.make_folder(output.parent)
     atomic.remove_leftovers(path for _, path in shot)
     atomic.remove_left_folders(output.parent)
-    printer = _Printer(quiet, bool(verbose))
+    printer = _Printer(quiet, bool(verbose), len(fused.order))
 
     def show(event: dict[str, Any]) -> None:
         fused.take(event)
         printer.show(event)
         printer.add(fused.written())
 
+    def fuse(lr: Path, hr: Path) -> None:
+        printer.fusing()
+        fused.fuse(lr, hr)
+
     try:
         if targets:
-            render_frames(program, scene, job, output.parent, show, fused.fuse, verbose=bool(verbose))
+            render_frames(program, scene, job, output.parent, show, fuse, verbose=bool(verbose))
     finally:
         printer.add(fused.written())  # frames that are written are reported even if a later one failed
         printer.end(as_json, fused.text, alone=not fused.averages)
@@ -222,8 +226,10 @@ def _check_files(
 class _Printer:
     """The progress and the reports of a shot, as they are printed."""
 
-    def __init__(self, quiet: bool, verbose: bool) -> None:
+    def __init__(self, quiet: bool, verbose: bool, count: int) -> None:
         self._quiet, self._bar, self._label = quiet, console.ProgressBar(shown=not quiet and not verbose), ""
+        #: Frames of the run, those that are done, and the fraction of the current one that is done.
+        self._count, self._done, self._fraction = count, 0, 0.0
         self._reports: list[dict[str, Any]] = []
 
     def show(self, event: dict[str, Any]) -> None:
@@ -231,8 +237,15 @@ class _Printer:
         if "step" in event:
             number = event.get("frame")
             self._label = event["step"] if number is None else f"frame {number}: {event['step']}"
-        if "report" not in event:
-            self._bar.update(self._label, event.get("samples", 0), 1)
+            self._fraction = event.get("fraction", 0.0)
+        if "report" in event:
+            self._done, self._fraction = self._done + 1, 0.0
+        else:  # each render is a third of the work
+            self._bar.update(self._label, self._done + self._fraction + event.get("samples", 0) / 3, self._count)
+
+    def fusing(self) -> None:
+        """Show that both renders are done."""
+        self._bar.update(f"{self._label.partition(':')[0]}: fusing", self._done + 2 / 3, self._count)
 
     def add(self, reports: Sequence[dict[str, Any]]) -> None:
         """Keep the reports of frames that are written, and print their warnings."""

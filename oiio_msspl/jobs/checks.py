@@ -6,11 +6,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.renderers import file_names
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, make_folder
 from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
@@ -21,12 +23,13 @@ from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.memory import check_frame_memory
 from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.pair_check import check_files
-from oiio_msspl.jobs.passes import check_passes
+from oiio_msspl.jobs.passes import check_passes, sets_to_fuse
 from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
 from oiio_msspl.jobs.sequence import FrameFiles, Shot, frame_in_name
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.views import find_other_views
-from oiio_msspl.model.catalogue import family_of, for_spread_noise
+from oiio_msspl.model.catalogue import family_of, find_model, for_spread_noise
+from oiio_msspl.model.contract import Contract
 
 log = logging.getLogger(__name__)
 
@@ -153,6 +156,33 @@ def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list
             problems = [f"can't be checked here: {check.problem}"] if check.problem else []
             return [f"frame {frame.number}: {text}" for text in [*problems, *check.warnings, *check.passed_on]]
     return []
+
+
+def look_ahead(frames: Sequence[FrameFiles], settings: Settings) -> dict[str, Any] | None:
+    """Describe the first pair that can be read by its headers, see :attr:`.ShotReport.found`.
+
+    Raises:
+        InputError: there is no such model.
+    """
+    for frame in frames:
+        if frame.lr is None or frame.hr is None:
+            continue
+        try:
+            lr, hr = map_pair(frame.lr, frame.hr, settings.inputs)
+            scale = align(lr, hr).scale
+            views = [hr, *find_other_views(lr, hr, settings.inputs, settings.write).hrls]
+            sets = {
+                additive.name: additive.layer_names for view in views for additive in sets_to_fuse(view, settings.write)
+            }
+        except InputError as error:  # the run says so when its turn comes
+            log.debug("frame %d: %s", frame.number, error)
+            continue
+        contract = Contract.of_file(find_model(scale, settings.model))
+        hr = hr.for_model(contract.hrls)
+        found = {"frame": frame.number, "renderer": hr.renderer, "scale": contract.scale, "model": contract.name}
+        names = [name_of(view.view) for view in views] if hr.other_views else []
+        return found | {"aovs": hr.table(contract.hrls), "notes": hr.notes, "views": names, "sets": sets}
+    return None
 
 
 def check_wanted_outputs(

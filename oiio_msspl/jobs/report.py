@@ -11,6 +11,7 @@ from typing import Any
 
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
+from oiio_msspl.aovs.features import ALBEDO
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.exr.contents import dropped_channels
@@ -140,7 +141,12 @@ def report_on(
         preview=preview_path,
         repaired=fused.repaired,
         negative=fused.negative,
-        warnings=[*spp_warnings(lr, hr, session.contract), *fused.warnings, *_pass_warnings(hr, fused)],
+        warnings=[
+            *_aov_warnings(hr, session.contract),
+            *spp_warnings(lr, hr, session.contract),
+            *fused.warnings,
+            *_pass_warnings(hr, fused),
+        ],
         tiles=fused.tiles,
         seconds={},
         features=frozenset(session.contract.hrls),
@@ -194,6 +200,13 @@ def _passes(fused: FusedFrame) -> dict[str, str]:
         texts[name] += f"; {fraction:.1%} of the beauty's light is in none of them"
     refused = {name: f"passed on: {reason}" for name, reason in fused.passes.refused.items() if name not in texts}
     return texts | refused
+
+
+def _aov_warnings(hr: MappedRender, contract: Contract) -> list[str]:
+    """Warn if the model reads an albedo and there is none."""
+    if ALBEDO not in contract.hrls or ALBEDO in hr.features:
+        return []
+    return ["no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"]
 
 
 def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:

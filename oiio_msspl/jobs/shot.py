@@ -21,7 +21,7 @@ from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.checks import check_first_pair, check_output, make_output, model_of_shot
+from oiio_msspl.jobs.checks import check_first_pair, check_output, look_ahead, make_output, model_of_shot
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.farm.dask import fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
@@ -62,6 +62,7 @@ def fuse_shot(
     skip_existing: bool = False,
     update: bool = False,
     report_path: str | Path | None = None,
+    begin: Callable[[ShotReport], None] | None = None,
     progress: ShotProgress | None = None,
     client: Client | None = None,
 ) -> ShotReport:
@@ -80,6 +81,8 @@ def fuse_shot(
         update: as ``skip_existing``, but fuse a frame again if an input is newer than its EXR, as ``make`` does.
         report_path: JSON file that is kept up to date frame by frame. With ``skip_existing``, skipped frames keep
             their entries of an earlier report.
+        begin: called before the first frame is fused with the report, whose ``found`` and ``temporal`` say what will be
+            done. It is not called if no frame is to be fused.
         progress: called after each frame with its result and the report so far. Frames that are skipped, missing or
             blocked by an existing file come first.
         client: a client of a Dask cluster that sees the same files, see
@@ -122,6 +125,11 @@ def fuse_shot(
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model))
+        report.found = look_ahead(to_fuse, settings)
+        if client is None and report.found is not None:
+            settings.session(report.found["scale"])  # a model that can't be used is refused before anything is told
+        if begin is not None:
+            begin(report)
     targets = [file for frame in shot.frames for file in (frame.output, frame.output.with_suffix(".png"))]
     remove_leftovers([*targets, *([] if path is None else [path])])
     try:

@@ -65,6 +65,9 @@ class ShotReport:
     """Entries of an earlier report about frames that are not in this run."""
     first: dict[str, Any] | None = None
     """The whole report of the first fused frame: scale, model and the layers that were read."""
+    found: dict[str, Any] | None = None
+    """What was found before the first frame: ``frame``, ``renderer``, ``scale``, ``model``, ``aovs``, ``notes``,
+    ``views`` and ``sets`` (layers by name) of the first pair that can be read."""
     seconds: float = 0.0
     """Wall time."""
     temporal: str = ""

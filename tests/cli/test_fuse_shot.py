@@ -21,7 +21,7 @@ from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["lr/#.##.exr", "hr", "-o", "out"], "has its frame number in one place"),
+        (["lr/##.##.exr", "hr", "-o", "out"], "has its frame number in one place"),
         (["lr/x.####.exr", "hr", "-o", "out"], "no file has such a name; the folder has .*lr.####.exr"),
         (["no/x.####.exr", "hr", "-o", "out"], "there is no folder"),
         (["lr/lr.1001.exr", "hr", "-o", "out"], "is a single file, the other one is a folder"),

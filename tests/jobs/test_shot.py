@@ -511,7 +511,7 @@ def test_layers_and_passes_that_differ_from_the_first_frame_are_a_warning(tmp_pa
     report = run(folder, bilinear_models[4])
     assert report.first["passes"]["light groups"].startswith("fused")
     assert report.results[1003].warnings == []
-    found = report.results[1002].warnings
+    found = [text for text in report.results[1002].warnings if not text.startswith("no albedo was found")]
     assert len(found) == len(warnings), found
     for text, expected in zip(found, warnings, strict=True):
         assert re.fullmatch(expected + "it may flicker", text)
@@ -836,3 +836,28 @@ def test_results_do_not_lie_among_the_low_resolution_renders(tmp_path, bilinear_
         fuse_shot(folder / "lr", folder / "hr", folder / "lr", model=str(bilinear_models[4]))
     report = fuse_shot(folder / "lr", folder / "hr", folder / "lr" / "out.####.exr", model=str(bilinear_models[4]))
     assert report.exit_code == 0
+
+
+def test_what_will_be_done_is_told_before_the_first_frame(tmp_path, bilinear_models):
+    """A frame that can't be read is passed over. A missing albedo is a warning of each frame."""
+    folder = make_shot(tmp_path, 2)
+    for frame in (1001, 1002):
+        beauty = rgb(picture(HEIGHT, WIDTH))
+        write_exr(
+            folder / "hr" / f"beauty.{frame}.exr", beauty | {f"light_{i}.{c}": beauty[c] for i in "ab" for c in "RGB"}
+        )
+    (folder / "lr/lr.1001.exr").write_text("no EXR")
+    told = []
+
+    def begin(report):
+        told.append((dict(report.found), report.temporal, list((folder / "out").iterdir())))
+
+    report = run(folder, bilinear_models[4], begin=begin, temporal=TemporalOptions("auto"))
+    ((found, temporal, written),) = told
+    assert written == [] and temporal == report.temporal and temporal.startswith("frame by frame: ")
+    assert (found["frame"], found["renderer"], found["scale"]) == (1002, "unknown", 4)
+    assert found["sets"] == {"light groups": "light_a, light_b"}
+    assert {row["feature"]: row["status"] for row in found["aovs"]}["albedo"] == "default"
+    assert "no albedo was found, so textures blur" in report.results[1002].warnings[0]
+    run(folder, bilinear_models[4], begin=begin, frames="1002", skip_existing=True)
+    assert len(told) == 1

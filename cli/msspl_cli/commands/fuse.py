@@ -187,7 +187,7 @@ def _fuse_shot(files: tuple[Path, Path, Path], scheduler: str | None, printer: S
         cluster = connect(scheduler)
     try:
         with cluster as client:
-            report = fuse_shot(*files, progress=printer, client=client, **settings)
+            report = fuse_shot(*files, begin=printer.begin, progress=printer, client=client, **settings)
     finally:
         printer.end()
     raise typer.Exit(report.exit_code)

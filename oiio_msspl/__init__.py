@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from oiio_msspl.fusion.fuse import FusedFrame, fuse
     from oiio_msspl.jobs.files import fuse_files
     from oiio_msspl.jobs.inputs import InputOptions
+    from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.report import FrameReport
     from oiio_msspl.jobs.shot import fuse_shot
     from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
@@ -50,6 +51,7 @@ _MODULES = {
     "Render": "exr.render",
     "Session": "model.session",
     "ShotReport": "jobs.shot_report",
+    "TemporalOptions": "jobs.plan",
     "Window": "exr.render",
     "WriteOptions": "exr.write_options",
     "find_model": "model.catalogue",
@@ -73,6 +75,7 @@ __all__ = [
     "Render",
     "Session",
     "ShotReport",
+    "TemporalOptions",
     "Window",
     "WriteOptions",
     "__version__",

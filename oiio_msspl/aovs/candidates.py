@@ -228,7 +228,8 @@ def missing(feature: str, candidate: Any, file: ExrFile) -> str:
         return f"{feature} is mapped to {text}, which is deep; flatten it first"
     if any(channel.name == text for part in file.parts for channel in part.channels):
         return f"{feature} is mapped to {text}, which is a channel, not a layer; msspl inspect names the layers"
-    return f"{feature} is mapped to {text}, which is not there"
+    there = ", ".join(layer.name for layer in layers_of(file) if layer.name and layer.triple())
+    return f"{feature} is mapped to {text}, which is not there" + (f" (layers: {there})" if there else "")
 
 
 def wrong_channels(feature: str, layer: Layer) -> str:

@@ -23,7 +23,7 @@ from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, is_sequence
-from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.settings import Settings, bytes_of
 from oiio_msspl.jobs.write import write_settled
 
 
@@ -37,8 +37,8 @@ def fuse_files(
     model: str | None = None,
     device: str = "cpu",
     threads: int = 0,
-    max_memory: int = MAX_MEMORY,
-    preview_path: str | Path | None = None,
+    max_memory: int | str = MAX_MEMORY,
+    preview_path: str | Path | bool | None = None,
     view_transform: str | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -54,8 +54,8 @@ def fuse_files(
             are the default quality, see :func:`oiio_msspl.model.catalogue.find_model`.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
-        max_memory: bytes that the process should stay below. The result does not depend on it.
-        preview_path: PNG to write, or None.
+        max_memory: bytes that the process should stay below, also as ``4G``. The result does not depend on it.
+        preview_path: PNG to write; True for one beside the result, None for none.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
         progress: called with (thousandths done, 1000) of the whole work, from reading to writing.
@@ -73,14 +73,17 @@ def fuse_files(
         raise InputError(f"{output}: the result is an EXR; name it .exr")
     if is_sequence(output):
         raise InputError(f"{output}: is a pattern, but LR and HR are single files; name one file")
-    if preview_path is not None:
+    max_memory = bytes_of(max_memory)
+    if preview_path is True:
+        preview_path = output.with_suffix(".png")
+    if preview_path:
         preview_path = check_target(preview_path, overwrite=overwrite)
         if preview_path.suffix.lower() != ".png":
             raise InputError(f"{preview_path}: the preview is a PNG; name it .png")
         if view_transform is not None:
             check_view(view_transform)
     settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite)
-    files = FrameFiles(0, Path(lr_path), Path(hr_path), output, preview_path)
+    files = FrameFiles(0, Path(lr_path), Path(hr_path), output, Path(preview_path) if preview_path else None)
     if progress is not None:
         progress(0, WHOLE)
     run = ShotRun(settings, ShotPlan(), [files], only_frame=True, tell=progress)

@@ -25,7 +25,7 @@ from oiio_msspl.model.session import Session
 LEAST_SHARE = 1 / 8
 
 
-@dataclass
+@dataclass(repr=False)
 class FrameReport:
     """The account of a fused pair, for people and, as :meth:`as_dict`, for programs."""
 
@@ -65,9 +65,15 @@ class FrameReport:
     about all views; those of another view than the first have its name in front."""
     fused_sets: list[AdditiveSet] = field(default_factory=list)
     """The additive sets that were fused."""
+    sources: tuple[str, str] | None = None
+    """What the result names as its LRHS and HRLS; None for their files."""
     layers: list[str] = field(default_factory=list)
     """The layers of the HRLS that are written beside the beauty, of all views, or their channels if they have no name.
     In a file with views (``left``) they are ``VIEW: LAYER``."""
+
+    def __repr__(self) -> str:
+        """Return one line; :meth:`as_dict` has everything."""
+        return f"<{self.output}, fused at x{self.scale} with {self.model}, {len(self.warnings)} warnings>"
 
     @property
     def spp_avg(self) -> float | None:
@@ -242,12 +248,13 @@ def provenance(report: FrameReport) -> dict[str, str]:
     sum of the layers, and of the products of light and colour, is the fused beauty. The names are those of the HRLS.
     """
     views = {"msspl/views": ", ".join(name_of(view.hr.view) for view in report.fused_views())}
+    lrhs, hrls = report.sources or (report.lr.name, report.hr.name)
     return (views if report.other_views else {}) | {
         "msspl/version": __version__,
         "msspl/model": report.model,
         "msspl/scale": str(report.scale),
-        "msspl/lrhs": report.lr.name,
-        "msspl/hrls": report.hr.name,
+        "msspl/lrhs": lrhs,
+        "msspl/hrls": hrls,
         "msspl/spp_lrhs": _spp(report.lr.spp),
         "msspl/spp_hrls": _spp(report.hr.spp),
         "msspl/spp_average": _spp(report.spp_avg),

@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
+from oiio_msspl.errors import InputError
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
+
+#: Bytes above which a size is a slip. Larger numbers are infinite as floats.
+LARGEST_MEMORY = 1 << 62
 
 
 @dataclass(frozen=True)
@@ -55,3 +60,20 @@ class Settings:
         if self.write.data_passes:
             session.require_clean_aovs()
         return session
+
+
+def bytes_of(size: int | str) -> int:
+    """Return the number of bytes that ``3G``, ``800M`` or a number means.
+
+    Raises:
+        InputError: the text can't be read, or no machine has so much memory.
+    """
+    if isinstance(size, int):
+        return size
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", size.strip(), re.IGNORECASE)
+    if not match:
+        raise InputError(f"--max-memory {size!r}: write it as 3G or 800M")
+    number = float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " ")
+    if number > LARGEST_MEMORY:
+        raise InputError("--max-memory: the number is too large; write it as 3G or 800M")
+    return int(number)

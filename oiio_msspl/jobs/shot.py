@@ -29,7 +29,7 @@ from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions, plan_temporal
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, Shot, find_shot
-from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.settings import Settings, bytes_of
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.model.devices import require_device
 
@@ -55,7 +55,7 @@ def fuse_shot(
     model: str | None = None,
     device: str = "cpu",
     threads: int = 0,
-    max_memory: int = MAX_MEMORY,
+    max_memory: int | str = MAX_MEMORY,
     previews: bool = False,
     view_transform: str | None = None,
     overwrite: bool = False,
@@ -111,9 +111,8 @@ def fuse_shot(
     check_output(shot, inputs, model, [] if path is None else [path])
     with limit_threads(threads):
         plan = plan_temporal(shot, inputs, temporal, model, write)
-    settings = Settings(
-        inputs, write, model, device, threads, max_memory, view_transform, overwrite, skip_existing or update, update
-    )
+    skip, memory = skip_existing or update, bytes_of(max_memory)
+    settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update)
     report = ShotReport(shot, temporal=plan.text, neighbours=plan.count)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
     make_output(shot)

@@ -54,7 +54,7 @@ class FrameResult:
     output: str = ""
 
 
-@dataclass
+@dataclass(repr=False)
 class ShotReport:
     """The results of a shot's frames."""
 
@@ -74,6 +74,11 @@ class ShotReport:
     """A sentence on the neighbours that frames are averaged with, and how motion is known; empty if switched off."""
     neighbours: int = 0
     """Frames before and after a frame that it is averaged with."""
+
+    def __repr__(self) -> str:
+        """Return one line; :meth:`as_dict` has everything."""
+        counts = Counter(result.status for result in self.results.values())
+        return f"<{self.shot.output}: {', '.join(f'{counts[status]} {status}' for status in counts) or 'no frames'}>"
 
     @property
     def exit_code(self) -> int:
@@ -224,6 +229,8 @@ def read_earlier(
     """
     if path is None:
         return {}
+    if path.is_file() and not (overwrite or skip_existing):
+        raise InputError(f"{path}: exists; pass --skip-existing to go on with that run, or --overwrite to replace it")
     check_target(path, overwrite=overwrite or skip_existing)
     if not path.exists():
         return {}

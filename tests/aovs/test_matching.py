@@ -330,6 +330,12 @@ def test_a_channel_that_is_mapped_is_no_layer(tmp_path):
         mapped(tmp_path, channels, {"albedo": "Z"})
 
 
+def test_a_wrong_mapping_is_answered_with_what_is_there(tmp_path):
+    channels = layer("", 1) | layer("paint", 2) | layer("facing", 0, "XYZ") | {"mask.A": plane(1)}
+    with pytest.raises(InputError, match=r"albedo is mapped to pant, which is not there \(layers: facing, paint\)"):
+        mapped(tmp_path, channels, {"albedo": "pant"})
+
+
 def test_a_grayscale_file_has_no_beauty(tmp_path):
     with pytest.raises(InputError, match="no layer with R, G, B among: Y; write the beauty as RGB"):
         mapped(tmp_path, {"Y": plane(1)})
@@ -337,7 +343,7 @@ def test_a_grayscale_file_has_no_beauty(tmp_path):
 
 def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):
     channels = layer("", 1) | {"mask.A": plane(1)}
-    with pytest.raises(InputError, match="albedo is mapped to nothing, which is not there"):
+    with pytest.raises(InputError, match=r"albedo is mapped to nothing, which is not there$"):
         mapped(tmp_path, channels, {"albedo": "nothing"})
     with pytest.raises(InputError, match=r"layer 'mask' has channels A, not R, G, B"):
         mapped(tmp_path, channels, {"albedo": "mask"})

@@ -243,6 +243,7 @@ def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, 
         shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))
     assert [list(frame.vectors) for frame in loaded] == [[1]] * 3
     assert counted and all(counted)
+    assert open_exr(tmp_path / "1002.exr").metadata["msspl/hrls"] == "a render that was not kept"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1001.exr", "1002.exr", "1003.exr"]
 
 

@@ -48,6 +48,15 @@ def test_the_result_is_written_over_the_hrls_s_data_window(pair, tmp_path, bilin
     assert set(report.seconds) == {"read", "fuse", "network", "write"}
 
 
+def test_python_takes_what_people_write(pair, tmp_path, bilinear_models):
+    """And a report that is printed is one line."""
+    report = fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), max_memory="2G", preview_path=True)
+    assert report.preview == tmp_path / "out.png" and report.preview.exists()
+    assert str(report) == f"<{tmp_path}/out.exr, fused at x4 with bilinear-x4, {len(report.warnings)} warnings>"
+    with pytest.raises(InputError, match="'much'"):
+        fuse_files(*pair, tmp_path / "more.exr", max_memory="much")
+
+
 @pytest.mark.parametrize(
     ("output", "more", "message"),
     [

@@ -386,7 +386,7 @@ def test_what_is_done_is_skipped_and_its_report_kept(tmp_path, bilinear_models):
     report_path = folder / "r.json"
     run(folder, bilinear_models[4], frames="1001-1002", report_path=report_path)
     before = contents(folder / "out")
-    with pytest.raises(InputError, match=r"r\.json: exists"):
+    with pytest.raises(InputError, match=r"r\.json: exists; pass --skip-existing to go on with that run"):
         run(folder, bilinear_models[4], report_path=report_path)
     report = run(folder, bilinear_models[4], skip_existing=True, report_path=report_path)
     assert [result.status for result in report.results.values()] == ["skipped", "skipped", "fused"]
@@ -853,6 +853,7 @@ def test_what_will_be_done_is_told_before_the_first_frame(tmp_path, bilinear_mod
         told.append((dict(report.found), report.temporal, list((folder / "out").iterdir())))
 
     report = run(folder, bilinear_models[4], begin=begin, temporal=TemporalOptions("auto"))
+    assert str(report) == f"<{folder}/out/beauty.####.exr: 1 failed, 1 fused>"
     ((found, temporal, written),) = told
     assert written == [] and temporal == report.temporal and temporal.startswith("frame by frame: ")
     assert (found["frame"], found["renderer"], found["scale"]) == (1002, "unknown", 4)

@@ -95,7 +95,9 @@ def fuse(
         bool | None, option(OUTPUT, "Set the fused layer's type. \\[default: as HR]", "--half/--float", hidden=True)
     ] = None,
     preview: Annotated[bool, option(OUTPUT, "Write an sRGB PNG beside OUT.", hidden=True)] = True,
-    view: Annotated[str | None, option(OUTPUT, "Preview in an OpenColorIO view.", metavar="VIEW", hidden=True)] = None,
+    view: Annotated[
+        str | None, option(OUTPUT, "Preview in an OpenColorIO view.", "--ocio-view", metavar="NAME", hidden=True)
+    ] = None,
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     # Shot
@@ -121,6 +123,7 @@ def fuse(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
+    version: options.Version = False,
 ) -> None:
     """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
 
@@ -135,6 +138,7 @@ def fuse(
     from oiio_msspl.exr.reader import use_threads
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import check_exists, is_sequence
+    from oiio_msspl.jobs.settings import bytes_of
 
     for path in (lr, hr):
         check_exists(path)
@@ -146,7 +150,7 @@ def fuse(
         "model": options.choose_model(model, quality),
         "device": device,
         "threads": threads,
-        "max_memory": options.parse_bytes(max_memory),
+        "max_memory": bytes_of(max_memory),
         "view_transform": view,
         "overwrite": overwrite,
     }

@@ -95,6 +95,7 @@ def render(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
+    version: options.Version = False,
 ) -> None:
     """Render a Blender scene at low and at full resolution, and fuse the two.
 
@@ -106,6 +107,7 @@ def render(
     from msspl_cli.rendered_frames import RenderedFrames, beside
     from oiio_msspl.exr.reader import use_threads
     from oiio_msspl.jobs.plan import TemporalOptions
+    from oiio_msspl.jobs.settings import bytes_of
     from oiio_msspl.model.contract import SCALES
 
     for name, value, choices in (("--scale", scale, SCALES), ("--filter", pixel_filter, ("box", "scene"))):
@@ -132,7 +134,7 @@ def render(
         model=options.choose_model(model, quality),
         device=device,
         threads=threads,
-        max_memory=options.parse_bytes(max_memory),
+        max_memory=bytes_of(max_memory),
         overwrite=overwrite,
     )
     job = {
@@ -163,13 +165,9 @@ def render(
         printer.show(event)
         printer.add(fused.written())
 
-    def fuse(lr: Path, hr: Path) -> None:
-        printer.fusing()
-        fused.fuse(lr, hr)
-
     try:
         if targets:
-            render_frames(program, scene, job, output.parent, show, fuse, verbose=bool(verbose))
+            render_frames(program, scene, job, output.parent, show, fused.fuse, verbose=bool(verbose))
     finally:
         printer.add(fused.written())  # frames that are written are reported even if a later one failed
         printer.end(as_json, fused.text, alone=not fused.averages)
@@ -242,10 +240,6 @@ class _Printer:
             self._done, self._fraction = self._done + 1, 0.0
         else:  # each render is a third of the work
             self._bar.update(self._label, self._done + self._fraction + event.get("samples", 0) / 3, self._count)
-
-    def fusing(self) -> None:
-        """Show that both renders are done."""
-        self._bar.update(f"{self._label.partition(':')[0]}: fusing", self._done + 2 / 3, self._count)
 
     def add(self, reports: Sequence[dict[str, Any]]) -> None:
         """Keep the reports of frames that are written, and print their warnings."""

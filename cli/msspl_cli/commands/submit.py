@@ -70,6 +70,7 @@ def submit(
     from oiio_msspl.jobs.farm.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import format_frames
+    from oiio_msspl.jobs.settings import bytes_of
 
     # A wrong value is refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
@@ -77,7 +78,7 @@ def submit(
     written = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
     write = options.make_write_options(**{name: given[name] for name in written})
     temporal = TemporalOptions(given["temporal"], given["motion_format"])
-    max_memory = options.parse_bytes(given["max_memory"])
+    max_memory = bytes_of(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
     settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view")}
     settings |= {"inputs": inputs, "model": model, "options": passed_on, "chunk": chunk, "timeout": timeout}

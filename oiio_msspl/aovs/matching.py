@@ -128,8 +128,10 @@ def _small_windows(render: MappedRender) -> list[str]:
     for name, channels in ({key: formula.channels for key, formula in render.features.items()} | alpha).items():
         owners = [render.file.siblings.get(channel.path, render.file).parts[channel.part] for channel in channels]
         if small := next((part for part in owners if whole.intersect(part.data_window) != whole), None):
-            text = f"its part '{small.name}' covers only {small.data_window} of {whole}, so it counts as 0 elsewhere"
-            notes.append(f"{name}: {text}")
+            window = small.data_window
+            notes.append(
+                f"{name}: its part '{small.name}' covers only {window} of {whole}, so it counts as 0 elsewhere"
+            )
     return notes
 
 

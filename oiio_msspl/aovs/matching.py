@@ -24,8 +24,8 @@ from oiio_msspl.aovs.renderers import (
     candidates_of,
     detect_renderer,
     entry_of,
+    known_as_other,
     names_of_aov,
-    names_of_others,
     samples_per_pixel,
     view_layer_of,
 )
@@ -74,7 +74,7 @@ def map_render(
         _check_holds_beauty(renderer, file)
     beauties = find_beauties(file, layers, [mapping[RGB]] if RGB in mapping else _beauty_candidates(renderer, file))
     if not beauties and RGB not in mapping:
-        beauties = find_beauties(file, layers, only_colour(layers, names_of_others(renderer)))
+        beauties = find_beauties(file, layers, only_colour(layers, known_as_other(renderer)))
     if not beauties:
         raise _no_beauty(file, layers, mapping.get(RGB))
     beauty = choose_beauty(file, beauties, view)

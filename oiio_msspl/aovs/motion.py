@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from oiio_msspl.aovs.renderers import names_of_others, renderers, view_layer_of
+from oiio_msspl.aovs.renderers import known_as_other, renderers, view_layer_of
 from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, same_spelling
@@ -29,6 +29,8 @@ CHOICES = {
 }
 #: Channels of a vector, where the entry of the table does not name them.
 _PAIRS = (("R", "G"), ("X", "Y"), ("u", "v"), ("U", "V"))
+#: The most layers of unknown names that the pixels are asked about: each takes a second.
+MOST_GUESSES = 8
 
 
 @dataclass(frozen=True)
@@ -143,21 +145,23 @@ def find_motion_layers(
     depths = [d[1] for alias in [*renderer.get("depth", ()), *common["depth"]] if (d := _named(named, alias))]
     # Of the layer without a name only Z can be a depth: R and Y are light.
     plain = [Layer("", "", {"Z": beauty.layer.channels["Z"]})] if "Z" in beauty.layer.channels else []
-    known = names_of_others(renderer)
-    unknown = [
-        name
-        for name, layer in named.items()
-        if len(layer.channels) in (2, 3)
-        and not any(view_layer_of(name, alias) is not None for alias in known)
-        and not set(read).intersection(layer.channels.values())
-    ]
     return MotionLayers(
         tuple(vectors.values()),
-        tuple(field for name in unknown for field in _fields(named, name, None, MotionFormat())),
+        tuple(_guesses(named, known_as_other(renderer), read)),
         next((triple for _, layer in filter(None, positions) if (triple := layer.triple())), None),
         next((channel for layer in [*depths, *plain] for channel in _depth_in(layer)), None),
         named,
     )
+
+
+def _guesses(
+    named: Mapping[str, Layer], is_known: Callable[[str], bool], read: Collection[Channel]
+) -> list[MotionField]:
+    """Return the layers of two or three channels that are neither known nor read, those of two channels first."""
+    unknown = {name: layer for name, layer in named.items() if len(layer.channels) in (2, 3) and not is_known(name)}
+    unread = [name for name, layer in unknown.items() if not set(read).intersection(layer.channels.values())]
+    unread.sort(key=lambda name: len(named[name].channels))
+    return [field for name in unread for field in _vectors_in(name, named[name], None, MotionFormat())][:MOST_GUESSES]
 
 
 def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionField]:
@@ -247,8 +251,13 @@ def _depth_in(layer: Layer) -> list[Channel]:
 def _fields(
     layers: Mapping[str, Layer], alias: str, components: Sequence[str] | None, form: MotionFormat
 ) -> Iterator[MotionField]:
-    """Yield the vectors of the layer that an alias means: in these channels, or in the first usual ones."""
-    name, layer = _named(layers, alias) or ("", Layer("", "", {}))
+    """Yield the vectors of the layer that an alias means."""
+    if found := _named(layers, alias):
+        yield from _vectors_in(*found, components, form)
+
+
+def _vectors_in(name: str, layer: Layer, components: Sequence[str] | None, form: MotionFormat) -> Iterator[MotionField]:
+    """Yield the vectors of a layer: in these channels, or in the first usual ones."""
     for pair in [tuple(components)] if components else _PAIRS:
         channels = [layer.channels[c] for c in pair if c in layer.channels]
         if len(channels) == 2 and all(c.type != "uint" for c in channels) and channels[0].part == channels[1].part:

@@ -7,7 +7,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
@@ -45,10 +45,20 @@ def candidates_of(renderer: Mapping[str, Any], feature: str) -> list[Any]:
     return own if feature in PAPER_FEATURES or renderer is common else [*own, *common[feature]]
 
 
-def names_of_others(renderer: Mapping[str, Any]) -> list[str]:
-    """Return the names and patterns that the table gives to layers that are no beauty."""
+def known_as_other(renderer: Mapping[str, Any]) -> Callable[[str], bool]:
+    """Return what tells by the table whether a layer of a name is something else than a beauty."""
     keys = (*OPTIONAL_FEATURES, "sets", "motion", "position", "depth", "data")
-    return [name for entry in (renderer, renderers()[-1]) for key in keys for name in _names_in(entry.get(key, []))]
+    entries = [entry.get(key, []) for entry in (renderer, renderers()[-1]) for key in keys]
+    names = {same_spelling(name) for entry in entries for name in _names_in(entry)}
+    patterns = [name for name in names if "*" in name]
+
+    def is_known(layer: str) -> bool:
+        name = same_spelling(layer.removesuffix(".000"))
+        words = name.split(".")
+        ends = (".".join(words[start:]) for start in range(len(words)))  # a view layer may stand in front
+        return not names.isdisjoint(ends) or any(fnmatchcase(name, pattern) for pattern in patterns)
+
+    return is_known
 
 
 def _names_in(entry: object) -> Iterator[str]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from oiio_msspl.aovs.renderers import best_spelled, entry_of, view_layer_of
@@ -59,18 +59,17 @@ def find_beauties(file: ExrFile, layers: list[Layer], candidates: Sequence[Any])
     return []
 
 
-def only_colour(layers: list[Layer], other_names: Iterable[str]) -> list[str]:
+def only_colour(layers: list[Layer], is_known: Callable[[str], bool]) -> list[str]:
     """Return the name of the only layer of R, G, B that is not known as something else; nothing if there are several.
 
     Args:
         layers: of the file; a name may occur once in each view.
-        other_names: names and patterns of layers that are no beauty.
+        is_known: tells whether a layer of a name is known as something else.
     """
-    known = list(other_names)
     colours = (
         layer for layer in layers if {"R", "G", "B"} <= layer.channels.keys() and layer.channels["R"].type != "uint"
     )
-    names = {layer.name for layer in colours if all(view_layer_of(layer.name, name) is None for name in known)}
+    names = {layer.name for layer in colours if not is_known(layer.name)}
     return list(names) if len(names) == 1 else []
 
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuse a low-resolution, high-spp render (LRHS) with a high-resolution, low-spp render (HRLS) of the same frame.
+"""Remove the noise of one render, of two of the same size, or of a low-resolution, high-spp render (LRHS) and a
+high-resolution, low-spp render (HRLS) of the same frame.
 
     from oiio_msspl import fuse_files
+    report = fuse_files(None, "hr.exr", "out.exr")
     report = fuse_files("lr.exr", "hr.exr", "out.exr")
 
-With arrays instead of files:
+With arrays instead of files, (height, width, 3) float32, scene linear:
 
-    from oiio_msspl import Render, Session, find_model, fuse
-    lr = Render.from_arrays("lr", rgb=low)                      # (h, w, 3) float32, scene linear
-    hr = Render.from_arrays("hr", rgb=high, albedo=albedo)      # (s*h, s*w, 3)
-    fused = fuse(lr, hr, Session(find_model(scale=4))).rgb
+    from oiio_msspl import fuse_arrays
+    clean = fuse_arrays(render, albedo=albedo, normal=normal, quality="best").rgb
 
 A name's module is imported when the name is first used, so that ``import oiio_msspl`` is fast.
 """
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from oiio_msspl.exr.render import Render, Window
     from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.fusion.fuse import FusedFrame, fuse
+    from oiio_msspl.jobs.arrays import fuse_arrays
     from oiio_msspl.jobs.files import fuse_files
     from oiio_msspl.jobs.inputs import InputOptions
     from oiio_msspl.jobs.plan import TemporalOptions
@@ -56,6 +57,7 @@ _MODULES = {
     "WriteOptions": "exr.write_options",
     "find_model": "model.catalogue",
     "fuse": "fusion.fuse",
+    "fuse_arrays": "jobs.arrays",
     "fuse_files": "jobs.files",
     "fuse_shot": "jobs.shot",
     "map_render": "aovs.matching",
@@ -81,6 +83,7 @@ __all__ = [
     "__version__",
     "find_model",
     "fuse",
+    "fuse_arrays",
     "fuse_files",
     "fuse_shot",
     "map_render",

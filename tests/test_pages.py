@@ -64,7 +64,6 @@ OTHER_PACKAGES = {
     "onnxruntime-gpu": "takes the place of onnxruntime",
     "bpy": "research.datagen.cycles, in an environment of its own",
     "pillow": "research.datagen.cycles, in an environment of its own",
-    "pyluxcore": "research/datagen/luxcore_pair.py, in an environment of its own",
 }
 
 
@@ -211,7 +210,7 @@ def check_arguments(program: str, arguments: list[str], monkeypatch: pytest.Monk
         if not program.endswith(".py"):
             runpy.run_module(program, run_name="__main__", alter_sys=True)
         else:
-            for renderer in ("bpy", "mathutils", "pyluxcore"):  # imported before the arguments are read
+            for renderer in ("bpy", "mathutils"):  # imported before the arguments are read
                 monkeypatch.setitem(sys.modules, renderer, MagicMock(**{"app.version": (5, 0, 0)}))
             runpy.run_path(str(ROOT / program), run_name="__main__")
 

@@ -46,10 +46,11 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-_LR = "Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr."
-LowRender = Annotated[Path, typer.Argument(metavar="LR", help=_LR, show_default=False)]
-_HR = "High-resolution, low-spp render, in the same form."
-HighRender = Annotated[Path, typer.Argument(metavar="HR", help=_HR, show_default=False)]
+_RENDERS = (
+    "One render, or two of the same frame: a low-resolution, high-spp render LR and a high-resolution, low-spp render "
+    "HR, or two of the same size. Each is an EXR. For a shot: a folder, or a pattern such as hr.####.exr."
+)
+Renders = Annotated[list[Path], typer.Argument(metavar="[LR] HR", help=_RENDERS, show_default=False)]
 
 _MAP = (
     "Read a feature (rgb, albedo or normal; for the model paper also diffuse, specular or variance) from this layer, "
@@ -90,6 +91,10 @@ Passes = Annotated[list[str], option(OUTPUT, _PASSES, metavar="PATTERN")]
 ErrorLayer = Annotated[
     bool, option(OUTPUT, "Add a layer 'error': the error that the model expects in each pixel.", "--error-layer")
 ]
+_TRUST = "Put back what both renders show and the network has removed (on), or keep the network's picture (off)."
+Trust = Annotated[str, option(OUTPUT, _TRUST, "--trust", metavar="on|off", hidden=True)]
+_TRUST_LAYER = "Add a layer 'trust': how much of what the network removed was put back, from 0 to 1."
+TrustLayer = Annotated[bool, option(OUTPUT, _TRUST_LAYER, "--trust-layer", hidden=True)]
 _DATA_PASSES = "Add the layers 'denoised_albedo' and 'denoised_normal'. It needs --quality best."
 DataPasses = Annotated[bool, option(OUTPUT, _DATA_PASSES, "--data-passes", hidden=True)]
 Overwrite = Annotated[bool, option(OUTPUT, "Replace existing files.", "--overwrite")]
@@ -159,6 +164,17 @@ def make_inputs(
     return InputOptions(mapped, view_layer, lr_spp, hr_spp, colourspace, tuple(sums or ()), map_file)
 
 
+def low_and_high(renders: list[Path]) -> tuple[Path | None, Path]:
+    """Return the paths of the LRHS and of the HRLS; None and that of the only render.
+
+    Raises:
+        InputError: there are more than two.
+    """
+    if len(renders) > 2:
+        raise InputError(f"{renders[2]}: is a third render; give one, or two of the same frame")
+    return renders[0] if len(renders) == 2 else None, renders[-1]
+
+
 def choose_model(model: str, quality: str | None) -> str:
     """Return the model that ``--model`` and ``--quality`` name.
 
@@ -185,11 +201,13 @@ def make_write_options(
     passes: list[str] | None = None,
     frames_layer: bool = False,
     data_passes: bool = False,
+    trust: str = "on",
+    trust_layer: bool = False,
 ) -> WriteOptions:
     """Return the options that describe the result.
 
     Raises:
-        InputError: an unknown layout or compression.
+        InputError: an unknown layout, compression or value of ``--trust``.
     """
     from oiio_msspl.exr.write_options import WriteOptions
 
@@ -197,6 +215,17 @@ def make_write_options(
     if passes and "auto" in passes and len(passes) > 1:
         raise InputError(f"--passes {', '.join(passes)}: auto fuses all sets; leave it out, or the others")
     patterns = () if passes == ["auto"] else tuple(passes or ())
+    if trust not in ("on", "off"):
+        raise InputError(f"--trust {trust!r}: use on or off")
     return WriteOptions(
-        layout, compression, pixel_type, tuple(layers), patterns, error_layer, frames_layer, data_passes
+        layout,
+        compression,
+        pixel_type,
+        tuple(layers),
+        patterns,
+        error_layer,
+        frames_layer,
+        trust=trust == "on",
+        trust_layer=trust_layer,
+        data_passes=data_passes,
     )

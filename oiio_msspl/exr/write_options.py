@@ -20,14 +20,14 @@ COMPRESSIONS = (*LOSSLESS, "pxr24", "b44", "b44a", "dwaa", "dwab", "lj2k")
 #: Replaces a lossy compression of the source.
 DEFAULT_COMPRESSION = "zip"
 
-#: Names of the layers that hold the predicted error, and how many frames were averaged.
-ERROR_LAYER, FRAMES_LAYER = "error", "frames"
+#: Names of the layers that hold the predicted error, how many frames were averaged, and how far the HRLS is believed.
+ERROR_LAYER, FRAMES_LAYER, TRUST_LAYER = "error", "frames", "trust"
 #: Names of the layers that hold albedo and normal without noise.
 ALBEDO_LAYER, NORMAL_LAYER = "denoised_albedo", "denoised_normal"
 #: The channels of these layers.
-COMPONENTS = {ERROR_LAYER: "Y", FRAMES_LAYER: "Y", ALBEDO_LAYER: "RGB", NORMAL_LAYER: "XYZ"}
+COMPONENTS = {ERROR_LAYER: "Y", FRAMES_LAYER: "Y", TRUST_LAYER: "Y", ALBEDO_LAYER: "RGB", NORMAL_LAYER: "XYZ"}
 #: The options that add them.
-OPTIONS = {ERROR_LAYER: "--error-layer", FRAMES_LAYER: "--frames-layer"}
+OPTIONS = {ERROR_LAYER: "--error-layer", FRAMES_LAYER: "--frames-layer", TRUST_LAYER: "--trust-layer"}
 OPTIONS |= dict.fromkeys((ALBEDO_LAYER, NORMAL_LAYER), "--data-passes")
 
 
@@ -55,6 +55,10 @@ class WriteOptions:
     """Add a layer ``error``: the error that the model predicts for the fused beauty."""
     frames_layer: bool = False
     """Add a layer ``frames``: the number of frames that were averaged in a pixel of a shot."""
+    trust: bool = True
+    """Put back what both renders show and the network has removed. False keeps the network's picture."""
+    trust_layer: bool = False
+    """Add a layer ``trust``: how much of the HRLS's difference to the network's picture was put back, from 0 to 1."""
     data_passes: bool = False
     """Add the layers ``denoised_albedo`` and ``denoised_normal``."""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuses an LRHS and an HRLS, in memory or on disk: the story of a frame."""
+"""Fuses an LRHS and an HRLS, two renders of one size, or one, in memory or on disk: the story of a frame."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.checks.pair import HrlsAverages, bounded_luminance, check_pair
+from oiio_msspl.fusion.checks.pair import HrlsAverages, are_not_independent, bounded_luminance, check_pair
 from oiio_msspl.fusion.passes.fuse import FusedPasses
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
 from oiio_msspl.fusion.tiles.prepare import FramePair
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, memory_to_fuse, require_memory, strips_memory
 from oiio_msspl.image.arrays import Array, blank, unload
+from oiio_msspl.image.filters import even_and_odd
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.session import Session
@@ -62,20 +63,27 @@ def fuse(
     session: Session,
     *,
     error: bool = False,
+    trust: bool = True,
     clean_aovs: bool = False,
     half: bool = False,
+    share: float | None = None,
     max_memory: int = MAX_MEMORY,
     held: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedFrame:
     """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
 
+    Two renders of one size are averaged and denoised. So is one render, which is given as both.
+
     Args:
         lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.matching.map_render`), or renders in memory.
         session: a model for the scale of the pair.
         error: also predict the error of the result.
+        trust: put back detail and light that both renders show, see
+            :func:`oiio_msspl.fusion.tiles.trust.trust_renders`.
         clean_aovs: also keep the albedo and the normal that the model denoises, see :attr:`Session.clean_aovs`.
         half: keep the result as half floats, in half the memory. Values above ``HALF_MAX`` are clipped.
+        share: of the LRHS in the mean of both renders, in [0, 1]; None to find it by their noise.
         max_memory: bytes that the whole process should stay below. The result does not depend on it.
         held: bytes that the caller holds beside this frame.
         progress: called with (tiles done, tiles in all).
@@ -91,11 +99,13 @@ def fuse(
     seconds = session.seconds
     with limit_threads(session.threads):
         averages, aovs = HrlsAverages(alignment), session.clean_aovs if clean_aovs else ()
-        pair = FramePair(lr, hr, alignment, session.contract, aovs, on_read=averages.add)
+        pair = FramePair(lr, hr, alignment, session.contract, aovs, share=share, on_read=averages.add)
         size = alignment.hr_data_window.height, alignment.hr_data_window.width
         rgb: NDArray[Any] = blank((*size, 3), np.float16 if half else np.float32, on_disk=False)
         errors: Array | None = blank((*size, 1), on_disk=False) if error else None
         frame = FusedFrame(rgb, None, errors, alignment, pair.exposure, {})
+        if trust and session.contract.denoiser and lr is not hr:
+            frame.trust = blank((alignment.grid.height, alignment.grid.width), on_disk=False)
         with hr.cache_strips(strips_memory(max_memory, held)):
             for task in fuse_tiles(tile_tasks(pair, frame), session):
                 frame.tiles = task.count
@@ -106,10 +116,28 @@ def fuse(
                 if progress is not None:
                     progress(task.number, task.count)
                 del task  # or its memory would be held while the next one is fused
+        if frame.trust is not None and are_not_independent(averages):
+            # The noise of one render can't be told from detail by that of the other one.
+            return fuse(
+                lr,
+                hr,
+                session,
+                error=error,
+                trust=False,
+                clean_aovs=clean_aovs,
+                half=half,
+                share=share,
+                max_memory=max_memory,
+                held=held,
+                progress=progress,
+            )
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
-        frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb
-        frame.warnings += check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
+        if lr is hr:
+            frame.lrhs_luminance, frame.hrls_luminance = even_and_odd(averages.rgb)
+        else:
+            frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb
+            frame.warnings += check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
     frame.warnings += _lost_aovs(frame)
     frame.seconds = session.seconds - seconds

@@ -36,6 +36,19 @@ def box_downsample(image: NDArray[Any], scale: int) -> Array:
     return result
 
 
+def even_and_odd(plane: Array) -> tuple[Array, Array]:
+    """Return two pictures of one (h, w), by its even and by its odd pixels, as on a chessboard.
+
+    Where a picture lacks a pixel, it is the mean of the four pixels around. So the noise of the two is independent if
+    that of the pixels is.
+    """
+    padded = np.pad(plane, 1, mode="edge")
+    around = (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]) * np.float32(0.25)
+    rows, columns = np.ogrid[: plane.shape[0], : plane.shape[1]]
+    is_even = (rows + columns) % 2 == 0
+    return np.where(is_even, plane, around), np.where(is_even, around, plane)
+
+
 def interpolate(values: Array, positions: NDArray[np.float64], axis: int) -> Array:
     """Sample an image (height, width, ...) linearly at positions between pixels along an axis, in pixels.
 
@@ -133,6 +146,20 @@ def max_3x3(values: Array) -> Array:
         np.maximum(lines[1:], before[:-1], out=lines[1:])
         np.maximum(lines[:-1], before[1:], out=lines[:-1])
     return largest
+
+
+def max_around(plane: Array, reach: int) -> Array:
+    """Return the largest value up to ``reach`` rows and columns away from each pixel, (h, w)."""
+    for axis in (0, 1):
+        distance, left = 1, reach
+        while left > 0:  # windows that overlap double their reach with each maximum
+            step = min(distance, left)
+            lines = plane.swapaxes(0, axis)
+            largest = lines.copy()
+            np.maximum(largest[step:], lines[:-step], out=largest[step:])
+            np.maximum(largest[:-step], lines[step:], out=largest[:-step])
+            plane, left, distance = largest.swapaxes(0, axis), left - step, 2 * distance
+    return plane
 
 
 def sum_3x3(values: Array) -> Array:

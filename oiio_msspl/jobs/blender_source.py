@@ -22,11 +22,10 @@ from oiio_msspl.fusion.tiles.tiling import result_bytes
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.inputs import map_pair
 from oiio_msspl.jobs.memory import memory_to_average, require_frame_memory
-from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.plan import AUTO, ShotPlan, TemporalOptions, ViewPlan, reach_of
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
-from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.settings import Settings, choose_model
 from oiio_msspl.jobs.timeline import neighbours
 from oiio_msspl.jobs.write import write_settled
 from oiio_msspl.model.catalogue import family_of
@@ -51,29 +50,36 @@ class RenderedShot:
     """Frames that are fused in the order in which they are rendered.
 
     The renders of a frame, and its fused pixels, are kept until no other frame needs them. So disk and memory hold a
-    few frames, however long the shot is.
+    few frames, however long the shot is. The model is loaded first, so that no frame is rendered for nothing.
 
     Args:
         settings: how a frame is fused.
+        scale: width of the frame / width of the LRHS.
         shot: all frames, without their renders.
         wanted: those of ``shot`` that are to be written.
         options: how many neighbours each frame is averaged with.
         keep: keep the renders of a frame beside its result, instead of deleting them.
 
     Raises:
-        InputError: a number of neighbours is asked for, and no frame has any.
+        InputError: the model or the device can't be had, or a number of neighbours is asked for and no frame has any.
     """
 
     def __init__(
         self,
         settings: Settings,
+        scale: int,
         shot: Sequence[FrameFiles],
         wanted: Sequence[FrameFiles],
         options: TemporalOptions,
         *,
         keep: bool = False,
     ) -> None:
-        self._settings, self._shot, self._wanted, self._keep = settings, shot, list(wanted), keep
+        settings = replace(settings, model=family_of(settings.model) or settings.model)
+        contract = settings.load(scale).contract
+        if contract.scale != scale:
+            raise InputError(f"--model {settings.model}: is for x{contract.scale}, but --scale is {scale}")
+        settings.session(scale)  # refuses a model that does not make the layers that are asked for
+        self._settings, self._scale, self._shot, self._wanted, self._keep = settings, scale, shot, list(wanted), keep
         self._required = options.frames != AUTO
         #: Number of the frame that an error is about.
         self._at_work = 0
@@ -131,9 +137,8 @@ class RenderedShot:
             InputError: the frame needs more memory than it may take, or a pattern of ``--passes`` matches no pass.
         """
         write = self._settings.write
-        (session,) = self._settings.sessions.values()
-        width, height = size
-        scale = session.contract.scale
+        (width, height), scale = size, self._scale
+        session = self._settings.load(scale)
         window, grid = Window(0, 0, width, height), Window(0, 0, -(-width // scale), -(-height // scale))
         alignment = Alignment(scale, grid, grid, window)
         reach = self._plan.views[None].reach

@@ -15,18 +15,24 @@ from oiio_msspl.aovs.renderers import file_names
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, make_folder
-from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
+from oiio_msspl.exr.write_options import (
+    ALBEDO_LAYER,
+    ERROR_LAYER,
+    FRAMES_LAYER,
+    NORMAL_LAYER,
+    TRUST_LAYER,
+    WriteOptions,
+)
 from oiio_msspl.exr.writer import check_layout
 from oiio_msspl.fusion.fuse import check_model
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.memory import check_frame_memory
-from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.passes import check_passes, sets_to_fuse
 from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
 from oiio_msspl.jobs.sequence import FrameFiles, Shot, frame_in_name
-from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.settings import Settings, choose_model
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import family_of, find_model, for_spread_noise
 from oiio_msspl.model.contract import Contract
@@ -125,7 +131,7 @@ def check_no_input(
     others = [inputs.files(path, model) for path in shot.hr.files.values()]
     folder, low = shot.output.folder, shot.lr.pattern.folder
     if shot.output.number is shot.hr.pattern.number and folder.is_dir() and folder.samefile(low):
-        raise InputError(f"{folder}: holds the low-resolution renders; name another folder for the results")
+        raise InputError(f"{folder}: holds renders that this run reads; name another folder for the results")
     check_separate(pairs.union(*others), [*(path for frame in shot.frames for path in frame.targets), *more_targets])
 
 
@@ -138,6 +144,7 @@ def check_written_layers(hr: MappedRender, write: WriteOptions) -> None:
     wanted = {
         ERROR_LAYER: write.error_layer,
         FRAMES_LAYER: write.frames_layer,
+        TRUST_LAYER: write.trust_layer,
         ALBEDO_LAYER: write.data_passes and ALBEDO in hr.features,
         NORMAL_LAYER: write.data_passes and NORMAL in hr.features,
     }
@@ -152,7 +159,7 @@ def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list
     """
     for frame in frames:
         if frame.lr is not None and frame.hr is not None:
-            check = check_files(frame.lr, frame.hr, inputs)
+            check = check_files(None if frame.lr == frame.hr else frame.lr, frame.hr, inputs)
             problems = [f"can't be checked here: {check.problem}"] if check.problem else []
             return [f"frame {frame.number}: {text}" for text in [*problems, *check.warnings, *check.passed_on]]
     return []

@@ -70,7 +70,9 @@ class ExistingResults:
         if self.skips(files):
             newer = self.newer_inputs(files)
             return result_of(files, SKIPPED, warnings=[older_than(newer[0])] if newer else [])
-        sources = (("LRHS", files.lr, shot.lr), ("HRLS", files.hr, shot.hr))
+        sources = [("LRHS", files.lr, shot.lr), ("HRLS", files.hr, shot.hr)]
+        if shot.has_one_render:
+            sources = [("render", files.hr, shot.hr)]
         lacking = [f"{name} ({sequence.pattern})" for name, path, sequence in sources if path is None]
         if lacking:
             return result_of(files, MISSING, f"no {' and no '.join(lacking)} of this number", 2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuses a pair of EXRs into one EXR and its preview: a shot of one frame."""
+"""Fuses one render or two into one EXR and its preview: a shot of one frame."""
 
 from __future__ import annotations
 
@@ -15,20 +15,19 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.inputs import InputOptions
+from oiio_msspl.jobs.inputs import InputOptions, both_paths
 from oiio_msspl.jobs.memory import memory_to_write
-from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.passes import WHOLE
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, is_sequence
-from oiio_msspl.jobs.settings import Settings, bytes_of
+from oiio_msspl.jobs.settings import Settings, bytes_of, choose_model
 from oiio_msspl.jobs.write import write_settled
 
 
 def fuse_files(
-    lr_path: str | Path,
+    lr_path: str | Path | None,
     hr_path: str | Path,
     output: str | Path,
     *,
@@ -43,10 +42,11 @@ def fuse_files(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> FrameReport:
-    """Fuse a pair of EXR files.
+    """Fuse the EXR files of a frame: one render, or two.
 
     Args:
-        lr_path, hr_path: the low-resolution, high-spp render and the high-resolution, low-spp render of one frame.
+        lr_path, hr_path: two renders of one frame, each with its own noise: the low-resolution, high-spp render and the
+            high-resolution, low-spp render, or two of the same size. None and the only render, if there is one.
         output: EXR to write.
         inputs: mapping, view and spp of the two files. If it names no view, all views and view layers are fused.
         write: layout, compression, pixel type and layers of the result.
@@ -83,7 +83,8 @@ def fuse_files(
         if view_transform is not None:
             check_view(view_transform)
     settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite)
-    files = FrameFiles(0, Path(lr_path), Path(hr_path), output, Path(preview_path) if preview_path else None)
+    preview = Path(preview_path) if preview_path else None
+    files = FrameFiles(0, *both_paths(lr_path, hr_path), output, preview)
     if progress is not None:
         progress(0, WHOLE)
     run = ShotRun(settings, ShotPlan(), [files], only_frame=True, tell=progress)

@@ -17,10 +17,10 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.source import MotionFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
-from oiio_msspl.fusion.passes.layers import is_large
+from oiio_msspl.fusion.passes.layers import is_large, layer_names, lrhs_names, with_light
 from oiio_msspl.image.arrays import Array, Mask, kept
 from oiio_msspl.jobs.memory import ViewMemory
-from oiio_msspl.jobs.passes import Progress
+from oiio_msspl.jobs.passes import Progress, sets_to_fuse
 from oiio_msspl.jobs.plan import ViewPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import FrameFiles
@@ -154,13 +154,16 @@ class ShotFrame:
         raise MssplError(f"frame {self.number}, its neighbour, has failed: {explain(self.error)[0]}") from self.error
 
     def read_if_small(self) -> RenderPair:
-        """Return the renders. Those of a small frame are read into memory, so that they are decoded once.
+        """Return the renders. Those of a small frame are decoded once, with the passes to fuse, into memory.
 
         Raises:
             InputError: pixels can't be decoded.
         """
         if self.renders.hr is self.stored[1] and not is_large(self.hr):
-            self.renders = RenderPair(self.stored[0].load(), self.stored[1].load())
+            sets = sets_to_fuse(self.hr, self.write)
+            high = _loaded(with_light(self.hr, layer_names(sets)))
+            low = high if self.lr is self.hr else _loaded(with_light(self.lr, lrhs_names(self.lr, sets)))
+            self.renders = RenderPair(low, high)
         return self.renders
 
     def motion_frame(self) -> MotionFrame:
@@ -185,3 +188,8 @@ class ShotFrame:
         self.means = self.frame_counts = None
         if self.fused is not None:
             self.fused = replace(self.fused, clean_aovs={}, error=None, frames=None)
+
+
+def _loaded(render: MappedRender) -> Render:
+    """Read the features of a render, with its alpha."""
+    return render.load([*render.features, "alpha"])

@@ -100,15 +100,18 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
 
     Returns:
         LRHS and HRLS. The LRHS has albedo and normal only if its file does. It is mapped for the view of the HRLS, or
-        for its own first view if it lacks that one.
+        for its own first view if it lacks that one. One render, whose path is given as both, is both.
 
     Raises:
-        InputError: one of the files can't be used, both are the same, the LRHS lacks the first view of the HRLS and
-            has another one, or their headers declare two colour spaces.
+        InputError: one of the files can't be used, two paths are the same file, the LRHS lacks the first view of the
+            HRLS and has another one, or their headers declare two colour spaces.
     """
     lr_path, hr_path = Path(lr_path), Path(hr_path)
-    if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
-        raise InputError(f"{lr_path}: given twice; give the low-resolution render, then the high-resolution one")
+    if lr_path == hr_path:
+        render = map_hrls(open_exr(hr_path), inputs)
+        render.space = _common_space(render, render, inputs.colourspace)
+        return MappedPair(render, render)
+    check_two_files(lr_path, hr_path)
     lr_file, hr_file = open_exr(lr_path), open_exr(hr_path)
     lr, hr = _map_lrhs(lr_file, inputs), map_hrls(hr_file, inputs)
     if hr.view in lr.other_views:
@@ -122,6 +125,24 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
     return MappedPair(lr, hr)
 
 
+def both_paths(lr_path: str | Path | None, hr_path: str | Path) -> tuple[Path, Path]:
+    """Return the paths of the LRHS and of the HRLS; that of the only render as both, if ``lr_path`` is None.
+
+    Raises:
+        InputError: both are the same file.
+    """
+    if lr_path is None:
+        return Path(hr_path), Path(hr_path)
+    check_two_files(Path(lr_path), Path(hr_path))
+    return Path(lr_path), Path(hr_path)
+
+
+def check_two_files(lr_path: Path, hr_path: Path) -> None:
+    """Raise InputError if two paths are the same file."""
+    if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
+        raise InputError(f"{lr_path}: given twice; give it alone, or two renders with a noise seed of their own")
+
+
 def map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputOptions) -> MappedPair:
     """Map a pair for another view or view layer.
 
@@ -133,7 +154,11 @@ def map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputO
     Raises:
         InputError: one of the files has no such view, or can't be used for it.
     """
-    high, low = map_other_hrls(hr, view, inputs), _map_lrhs(lr.file, replace(inputs, view=view))
+    high = map_other_hrls(hr, view, inputs)
+    if lr is hr:
+        high.space = hr.space
+        return MappedPair(high, high)
+    low = _map_lrhs(lr.file, replace(inputs, view=view))
     if low.view != view:
         raise InputError(f"{lr.name}: has no view or view layer {view!r}")
     low.space = high.space = hr.space

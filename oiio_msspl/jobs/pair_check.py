@@ -9,7 +9,7 @@ from typing import Any
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.checks.pair import BOTH_BLACK, check_renders
-from oiio_msspl.jobs.inputs import InputOptions, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, both_paths, map_pair
 from oiio_msspl.jobs.report import merged
 from oiio_msspl.jobs.views import find_other_views
 
@@ -18,7 +18,8 @@ from oiio_msspl.jobs.views import find_other_views
 class PairCheck:
     """The result of :func:`check_files`."""
 
-    lr: Path
+    lr: Path | None
+    """None for one render."""
     hr: Path
     problem: str | None = None
     """Why the pair can't be fused; None if it can."""
@@ -35,25 +36,25 @@ class PairCheck:
     def as_dict(self) -> dict[str, Any]:
         """Return the check as JSON values."""
         findings = {"problem": self.problem, "warnings": self.warnings, "passed_on": self.passed_on}
-        return {"lrhs": str(self.lr), "hrls": str(self.hr), "fits": self.fits, **findings}
+        return {"lrhs": None if self.lr is None else str(self.lr), "hrls": str(self.hr), "fits": self.fits, **findings}
 
 
-def check_files(lr: str | Path, hr: str | Path, inputs: InputOptions = InputOptions()) -> PairCheck:
+def check_files(lr: str | Path | None, hr: str | Path, inputs: InputOptions = InputOptions()) -> PairCheck:
     """Check whether two files show the same frame, see :func:`oiio_msspl.fusion.checks.pair.check_pair`.
 
     Args:
-        lr, hr: the low-resolution and the high-resolution render.
+        lr, hr: the low-resolution and the high-resolution render; None and the only render.
         inputs: mapping, view and colour space of the two files. If it names no view, all are checked.
 
     Returns:
         The check. If the pair can't be fused, ``problem`` says why, and nothing is raised.
     """
-    lr, hr = Path(lr), Path(hr)
+    lr, hr = None if lr is None else Path(lr), Path(hr)
     try:
-        first = map_pair(lr, hr, inputs)
+        first = map_pair(*both_paths(lr, hr), inputs)
         others = find_other_views(*first, inputs)
         views = [first, *((view.lr, view.hr) for view in others.views)]
-        warnings = merged({high.view: check_renders(low, high) for low, high in views})
+        warnings = merged({high.view: check_renders(low, high) for low, high in views if low is not high})
         return PairCheck(lr, hr, warnings=warnings, passed_on=others.passed_on)
     except InputError as error:
         return PairCheck(lr, hr, problem=str(error))

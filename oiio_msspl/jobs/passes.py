@@ -1,25 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The passes of a frame: which sets of layers are fused, and their turn in the work on the frame."""
+"""Which passes of a frame are fused, and the steps in which a frame is fused, for progress."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.contents import dropped_channels, stored_type
-from oiio_msspl.exr.render import Render
+from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
-from oiio_msspl.fusion.tiles.network import layer_fuser
-from oiio_msspl.fusion.tiles.tiling import strips_memory
-from oiio_msspl.image.arrays import HALF_MAX
-from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.model.catalogue import measured
 from oiio_msspl.model.session import Session
 
@@ -68,49 +59,6 @@ def _written_sets(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
     dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
     written = (layers for layers in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in layers.layers))
     return list(written)
-
-
-def fuse_frame_passes(
-    lr: MappedRender,
-    hr: MappedRender,
-    fused: FusedFrame,
-    session: Session,
-    write: WriteOptions,
-    max_memory: int,
-    progress: Callable[[int, int], None] | None = None,
-    averaged: tuple[Render, Render] | None = None,
-) -> None:
-    """Fuse the additive sets of :func:`sets_to_fuse` and add them to ``fused``.
-
-    Args:
-        lr, hr: the pair, as files.
-        fused: its fused beauty.
-        session: the model of the beauty. Its memory is used for the passes.
-        write: ``passes`` says which, and ``pixel_type`` how the beauty is stored.
-        max_memory: bytes that the process should stay below.
-        progress: called with (steps done, steps in all) of this part of the work.
-        averaged: see :class:`oiio_msspl.fusion.passes.fuse.PassInputs`.
-
-    Raises:
-        InputError: pixels can't be decoded.
-    """
-    sets = sets_to_fuse(hr, write)
-    if sets:
-        session.release_memory()
-        beauty = fused.rgb
-        if stored_type(hr.beauty_channels, write) == "half" and beauty.dtype != np.float16:
-            # The passes sum to the beauty that is written.
-            beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
-        with limit_threads(session.threads):
-            fused.passes = fuse_passes(
-                PassInputs(lr, hr, beauty, fused.alignment, sets, fused.clean_aovs, averaged),
-                fused.replaced,
-                fuse_layers=layer_fuser(session, fused),
-                cache_bytes=strips_memory(max_memory, fused.nbytes),
-                progress=progress,
-            )
-        fused.replaced = fused.passes.pixels
-        session.release_layer_memory()
 
 
 #: Cost of a megapixel, where 1 is Open Image Denoise's: one layer of a set, by fitting and by a network, and one

@@ -21,8 +21,8 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
 from oiio_msspl.jobs.inputs import InputOptions, MappedPair, map_other_hrls, map_pair
-from oiio_msspl.jobs.model_choice import family_for_layers
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
+from oiio_msspl.jobs.settings import family_for_layers
 from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline, neighbours
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of

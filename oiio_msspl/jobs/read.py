@@ -90,7 +90,7 @@ def _set_pair(frame: ShotFrame, lr: MappedRender, hr: MappedRender, settings: Se
     """Give a view its pair."""
     frame.lr, frame.hr, frame.write = lr, hr, settings.write
     if frame.view is not None:  # layers about the fused picture are those of the first view
-        frame.write = replace(settings.write, error_layer=False, data_passes=False, pixel_type=None)
+        frame.write = replace(settings.write, error_layer=False, trust_layer=False, data_passes=False, pixel_type=None)
     sets = sets_to_fuse(hr, frame.write) if frame.plan.reach.renders else []
     frame.stored = pass_features(lr, hr, sets) if sets else (lr, hr)
     frame.renders = RenderPair(*frame.stored)
@@ -150,5 +150,6 @@ def _read_pixels(frame: ShotFrame) -> None:
         high, stored = memory.hr.load_with(channels, memory.features, on_disk=memory.on_disk)
         vectors = motion.vectors_of(frame.hr, high, stored) if motion and channels else {}
         frame.vectors = {direction: (kept(pixels), kept(mask)) for direction, (pixels, mask) in vectors.items()}
-        frame.renders = RenderPair(memory.lr.load(memory.features, on_disk=memory.on_disk), high)
+        low = high if memory.lr is memory.hr else memory.lr.load(memory.features, on_disk=memory.on_disk)
+        frame.renders = RenderPair(low, high)
     frame.seconds["read"] = time.perf_counter() - start

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.layers import layer_by_channel, layers_of
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.contract import ONE_SIZE, Contract
 from oiio_msspl.model.session import Session
 
 #: Samples of the LRHS below which a pair gets a warning, as a share of those of the HRLS, both per pixel of the frame.
@@ -58,6 +59,8 @@ class FrameReport:
     """Features that the model reads of an LRHS that has them, beside colour."""
     passes: dict[str, str] = field(default_factory=dict)
     """A sentence on each additive set, by name: fused or passed on."""
+    trust: float | None = None
+    """Mean share of what the network had removed and was put back because both renders show it; None without trust."""
     network_seconds: float = 0.0
     """``seconds["network"]``, known before the others."""
     other_views: list[FrameReport] = field(default_factory=list)
@@ -76,10 +79,15 @@ class FrameReport:
         return f"<{self.output}, fused at x{self.scale} with {self.model}, {len(self.warnings)} warnings>"
 
     @property
+    def is_one_render(self) -> bool:
+        """Whether the frame has one render, which is both ``lr`` and ``hr``."""
+        return self.lr.file is self.hr.file
+
+    @property
     def spp_avg(self) -> float | None:
         """Average samples: spp_LRHS / s^2 + spp_HRLS (section 5.1), or None if a header does not say."""
-        if self.lr.spp is None or self.hr.spp is None:
-            return None
+        if self.lr.spp is None or self.hr.spp is None or self.is_one_render:
+            return self.hr.spp if self.is_one_render else None
         return self.lr.spp / self.scale**2 + self.hr.spp
 
     def aovs(self) -> list[dict[str, str]]:
@@ -98,12 +106,13 @@ class FrameReport:
 
     def found_lrhs_aovs(self) -> dict[str, str]:
         """Return the features of ``lrhs_aovs`` that the LRHS has, with their layers."""
-        return {name: self.lr.features[name].text for name in self.lrhs_aovs if name in self.lr.features}
+        names = () if self.is_one_render else self.lrhs_aovs
+        return {name: self.lr.features[name].text for name in names if name in self.lr.features}
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values."""
         return {
-            "lrhs": self.lr.name,
+            "lrhs": None if self.is_one_render else self.lr.name,
             "hrls": self.hr.name,
             "output": str(self.output),
             "preview": str(self.preview) if self.preview else None,
@@ -113,7 +122,7 @@ class FrameReport:
             "fused_views": [{"view": view.hr.view or None, "aovs": view.aovs()} for view in self.fused_views()],
             "size": self.hr.display_window.size,
             "scale": self.scale,
-            "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
+            "spp": {"lrhs": None if self.is_one_render else self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
             "provider": self.provider,
             "convolutions": self.convolutions,
@@ -125,6 +134,7 @@ class FrameReport:
             "repaired": self.repaired,
             "negative": self.negative,
             "clipped": self.clipped,
+            "trust": None if self.trust is None else round(self.trust, 4),
             "warnings": self.warnings,
             "tiles": self.tiles,
             "seconds": {k: round(v, 3) for k, v in self.seconds.items()},
@@ -158,6 +168,7 @@ def report_on(
         features=frozenset(session.contract.hrls),
         lrhs_aovs=tuple(session.contract.lrhs[1:]),
         passes=_passes(fused),
+        trust=None if fused.trust is None else float(fused.trust.mean()),
         network_seconds=fused.seconds,
         fused_sets=fused.passes.sets if fused.passes else [],
     )
@@ -217,6 +228,8 @@ def _aov_warnings(hr: MappedRender, contract: Contract) -> list[str]:
 
 def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:
     """Warn of samples per pixel that the method or the model was not made for."""
+    if contract.scale == ONE_SIZE:
+        return []
     warnings = []
     if lr.spp is not None and hr.spp is not None and lr.spp / contract.scale**2 < LEAST_SHARE * hr.spp:
         warnings.append(
@@ -224,7 +237,9 @@ def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list
         )
     for name, key, spp in (("HRLS", "hrls", hr.spp), ("LRHS", "lrhs", lr.spp)):
         trained = contract.training_spp.get(key)
-        if spp is not None and trained and not trained[0] <= spp <= trained[1]:
+        # Where a network saw fewer samples, it removes detail, which the renders give back to all but the paper's.
+        most = math.inf if contract.denoiser or trained is None else trained[1]
+        if spp is not None and trained and not trained[0] <= spp <= most:
             warnings.append(f"the {name} has {spp:g} spp; {contract.name} was trained on {trained[0]} to {trained[1]}")
     return warnings
 
@@ -249,18 +264,22 @@ def provenance(report: FrameReport) -> dict[str, str]:
     """
     views = {"msspl/views": ", ".join(name_of(view.hr.view) for view in report.fused_views())}
     lrhs, hrls = report.sources or (report.lr.name, report.hr.name)
-    return (views if report.other_views else {}) | {
-        "msspl/version": __version__,
-        "msspl/model": report.model,
-        "msspl/scale": str(report.scale),
-        "msspl/lrhs": lrhs,
-        "msspl/hrls": hrls,
-        "msspl/spp_lrhs": _spp(report.lr.spp),
-        "msspl/spp_hrls": _spp(report.hr.spp),
-        "msspl/spp_average": _spp(report.spp_avg),
-        "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
-        "msspl/passes": json.dumps(_fused_layers(report)),
-    }
+    second = {} if report.is_one_render else {"msspl/lrhs": lrhs, "msspl/spp_lrhs": _spp(report.lr.spp)}
+    return (
+        (views if report.other_views else {})
+        | second
+        | {
+            "msspl/version": __version__,
+            "msspl/model": report.model,
+            "msspl/scale": str(report.scale),
+            "msspl/hrls": hrls,
+            "msspl/spp_hrls": _spp(report.hr.spp),
+            "msspl/spp_average": _spp(report.spp_avg),
+            "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
+            "msspl/trust": "off" if report.trust is None else f"{report.trust:.4f}",
+            "msspl/passes": json.dumps(_fused_layers(report)),
+        }
+    )
 
 
 def _spp(spp: float | None) -> str:

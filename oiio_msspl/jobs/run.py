@@ -11,7 +11,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, is_light_of_pass
+from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import stored_type
@@ -24,15 +27,18 @@ from oiio_msspl.fusion.neighbours.average import average_renders, average_result
 from oiio_msspl.fusion.neighbours.hops import find_hops
 from oiio_msspl.fusion.neighbours.path import Hop
 from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes
+from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import is_large
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.tiling import require_memory
-from oiio_msspl.image.arrays import kept
+from oiio_msspl.fusion.tiles.network import layer_fuser
+from oiio_msspl.fusion.tiles.tiling import require_memory, strips_memory
+from oiio_msspl.image.arrays import HALF_MAX, kept
+from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State
 from oiio_msspl.jobs.inputs import MappedPair
 from oiio_msspl.jobs.memory import check_frame_memory, light_features
-from oiio_msspl.jobs.passes import Progress, costs_of, fuse_frame_passes, uses_clean_aovs
+from oiio_msspl.jobs.passes import Progress, costs_of, sets_to_fuse, uses_clean_aovs
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.read import features_read, read_frame
 from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, written_layers
@@ -40,6 +46,7 @@ from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key
 from oiio_msspl.jobs.views import store_view
+from oiio_msspl.model.contract import ONE_SIZE
 
 
 class ShotRun:
@@ -169,8 +176,10 @@ class ShotRun:
             frame.averaged.hr,
             frame.session,
             error=frame.write.error_layer,
+            trust=frame.write.trust,
             clean_aovs=uses_clean_aovs(frame.hr, frame.write),
             half=half,
+            share=_share_by_spp(frame.lr, frame.hr),
             max_memory=self.settings.max_memory,
             held=frame.held_bytes,
             progress=frame.progress,
@@ -224,10 +233,26 @@ class ShotRun:
 
     def _fuse_passes(self, frame: ShotFrame, picture: FusedFrame) -> None:
         """Fuse the passes of a view and add them to its final picture."""
-        room = self.settings.max_memory - frame.held_bytes
-        fuse_frame_passes(
-            frame.lr, frame.hr, picture, frame.session, frame.write, room, frame.progress, averaged=frame.means
-        )
+        sets = sets_to_fuse(frame.hr, frame.write)
+        if not sets:
+            return
+        session, beauty, decoded = frame.session, picture.rgb, (frame.renders.lr, frame.renders.hr)
+        session.release_memory()  # for the passes
+        if stored_type(frame.hr.beauty_channels, frame.write) == "half" and beauty.dtype != np.float16:
+            # The passes sum to the beauty that is written.
+            beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
+        with limit_threads(session.threads):
+            picture.passes = fuse_passes(
+                PassInputs(
+                    frame.lr, frame.hr, beauty, picture.alignment, sets, picture.clean_aovs, frame.means, decoded
+                ),
+                picture.replaced,
+                fuse_layers=layer_fuser(session, picture),
+                cache_bytes=strips_memory(self.settings.max_memory - frame.held_bytes, picture.nbytes),
+                progress=frame.progress,
+            )
+        picture.replaced = picture.passes.pixels
+        session.release_layer_memory()
 
     def _unplanned_views(self, first: ShotFrame) -> list[str]:
         """Return a sentence for each view that is fused frame by frame because the plan does not know it."""
@@ -291,7 +316,15 @@ def _replace_by_means(frame: ShotFrame, before: Sequence[Hop[RenderPair]], after
     frame.averaged = RenderPair(lr, hr)
     if passes:
         on_disk = is_large(frame.hr)
-        frame.means = _kept(lr, on_disk=on_disk), _kept(hr, on_disk=on_disk)
+        high = _kept(hr, on_disk=on_disk)
+        frame.means = high if lr is hr else _kept(lr, on_disk=on_disk), high
+
+
+def _share_by_spp(lr: MappedRender, hr: MappedRender) -> float | None:
+    """Return the share of the first of two renders of one size in their mean; None for other pairs, or unknown spp."""
+    if lr.spp is None or hr.spp is None or align(lr, hr).scale != ONE_SIZE:
+        return None
+    return lr.spp / (lr.spp + hr.spp)
 
 
 def _kept(render: Render, *, on_disk: bool) -> Render:

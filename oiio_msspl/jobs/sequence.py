@@ -118,12 +118,17 @@ class FrameFiles:
 
 @dataclass(frozen=True)
 class Shot:
-    """Two sequences and the frames to fuse, in the order in which they are fused."""
+    """Two sequences and the frames to fuse, in the order in which they are fused. One render a frame is both."""
 
     lr: Sequence
     hr: Sequence
     output: Pattern
     frames: list[FrameFiles]
+
+    @property
+    def has_one_render(self) -> bool:
+        """Whether each frame has one render."""
+        return self.lr is self.hr
 
     def target(self, number: int) -> Path:
         """Return the file of a fused frame."""
@@ -147,11 +152,14 @@ def _number_fields(name: str) -> list[re.Match[str]]:
     return list(_NUMBER_FIELD.finditer(name)) or list(_SHORT_FIELD.finditer(name))
 
 
-def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | Iterable[int] | None = None) -> Shot:
-    """Pair the frames of two sequences.
+def find_shot(
+    lr: str | Path | None, hr: str | Path, output: str | Path, frames: str | Iterable[int] | None = None
+) -> Shot:
+    """Pair the frames of two sequences, or find those of one.
 
     Args:
-        lr, hr: folders, or patterns such as ``lr.####.exr``, ``lr.%04d.exr``, ``lr.@@@@.exr`` and ``lr.$F4.exr``.
+        lr, hr: folders, or patterns such as ``lr.####.exr``, ``lr.%04d.exr``, ``lr.@@@@.exr`` and ``lr.$F4.exr``. None
+            and the only sequence, if each frame has one render.
         output: a pattern, or a folder, whose files are then named as those of the HRLS.
         frames: frame numbers, or a range such as ``1001-1100x2,1200``; None for every frame of either sequence.
 
@@ -161,8 +169,11 @@ def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | 
     Raises:
         InputError: there are no frames, a pattern can't be read, or several sequences in a folder could be meant.
     """
-    lows, highs = (_not_written(_sequences(Path(path)), Path(output)) for path in (lr, hr))
-    low, high = _choose(lows, highs, Path(lr), Path(hr))
+    found = [_not_written(_sequences(Path(path)), Path(output)) for path in (lr, hr) if path is not None]
+    if lr is None:
+        low = high = _only(found[0], Path(hr))
+    else:
+        low, high = _choose(found[0], found[1], Path(lr), Path(hr))
     numbers = sorted(low.files.keys() | high.files.keys()) if frames is None else parse_frames(frames)
     pattern = _output_pattern(Path(output), high.pattern)
     files = [FrameFiles(n, low.files.get(n), high.files.get(n), _target(pattern, high, n)) for n in numbers]
@@ -334,6 +345,14 @@ def _sequences_in(folder: Path) -> list[Sequence]:
             raise InputError(f"{pattern}: some numbers occur with and without zeros in front; give a pattern")
         sequences.append(Sequence(pattern, files))
     return sequences
+
+
+def _only(sequences: list[Sequence], path: Path) -> Sequence:
+    """Return the only sequence of a folder, or of a pattern."""
+    if len(sequences) > 1:
+        names = ", ".join(sequence.pattern.name for sequence in sequences[:6])
+        raise InputError(f"{path}: has several sequences ({names}); name the one to fuse, or two that belong together")
+    return sequences[0]
 
 
 def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> tuple[Sequence, Sequence]:

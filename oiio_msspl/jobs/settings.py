@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the user has chosen for a job: inputs, output, model and memory."""
+"""What the user has chosen for a job: inputs, output, model and memory. A model that is not named suits the pair."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
+from oiio_msspl.fusion.neighbours.renders import RenderPair
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.jobs.inputs import InputOptions
-from oiio_msspl.model.catalogue import load_model
+from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of, for_spread_noise, load_model
+from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.session import Session
 
 #: Bytes above which a size is a slip. Larger numbers are infinite as floats.
@@ -77,3 +84,53 @@ def bytes_of(size: int | str) -> int:
     if number > LARGEST_MEMORY:
         raise InputError("--max-memory: the number is too large; write it as 3G or 800M")
     return int(number)
+
+
+def choose_model(
+    lr: MappedRender, hr: MappedRender, model: str | None, read: Callable[[], RenderPair] | None = None
+) -> tuple[str, bool]:
+    """Return the model to use, and whether the pair has noise that decides it: a black frame has none.
+
+    For a quality, ``auto`` and None, the model is a family that suits the pair. ``best`` gains nothing without an
+    albedo and a normal, and the default quality replaces it. Noise that the pixel filter has spread needs the family
+    that was trained for it. Notes of the HRLS say so, and if a model that is named does not suit the noise.
+
+    Args:
+        lr, hr: the pair.
+        model: what the user has chosen.
+        read: gives the pair in memory; None to look at small samples of the files.
+
+    Raises:
+        InputError: the pair does not fit together.
+    """
+
+    def is_spread() -> bool | None:
+        pair = RenderPair(lr, hr) if read is None else read()
+        return is_noise_spread(pair.lr, pair.hr, align(lr, hr))
+
+    family = family_of(model)
+    if family is None:
+        assert model is not None
+        suited = for_spread_noise(model)
+        spread = suited is not None and is_spread()
+        if spread:
+            hr.notes.append(
+                f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise; use "
+                f"--model {suited}"
+            )
+        return model, spread is not None
+    suited = family_for_layers(hr, family)
+    if suited != family:
+        family = suited
+        hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
+    spread = is_spread()
+    if not spread:
+        return family, spread is not None
+    hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")
+    return family + SPREAD, True
+
+
+def family_for_layers(hr: MappedRender, family: str) -> str:
+    """Return the family; the default quality's in place of that of ``best`` for an HRLS without albedo and normal."""
+    lacks = family == QUALITIES["best"] and hr.features.keys().isdisjoint((ALBEDO, NORMAL))
+    return QUALITIES[DEFAULT_QUALITY] if lacks else family

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuses a shot: every frame of two sequences, in this process or on a Dask cluster.
+"""Fuses a shot: every frame of two sequences, or of one, in this process or on a Dask cluster.
 
 A bad frame is reported and does not stop the others. A new EXR gets its name last, after its preview, so an EXR that
 exists is a complete frame. An EXR that is replaced comes before its preview, so a run that is killed between the two
@@ -44,7 +44,7 @@ ShotProgress = Callable[[FrameResult, ShotReport], None]
 
 
 def fuse_shot(
-    lr: str | Path,
+    lr: str | Path | None,
     hr: str | Path,
     output: str | Path,
     *,
@@ -66,7 +66,7 @@ def fuse_shot(
     progress: ShotProgress | None = None,
     client: Client | None = None,
 ) -> ShotReport:
-    """Fuse two sequences. A frame that can't be fused is reported, and the others go on.
+    """Fuse two sequences, or one. A frame that can't be fused is reported, and the others go on.
 
     Args:
         lr, hr: folders or patterns, see :func:`oiio_msspl.jobs.sequence.find_shot`.

@@ -103,7 +103,7 @@ class ShotReport:
         counts = Counter(entry.get("status") for entry in entries)
         finished = len(self.results) == len(self.shot.frames)
         return {
-            "lrhs": str(self.shot.lr.pattern),
+            "lrhs": None if self.shot.has_one_render else str(self.shot.lr.pattern),
             "hrls": str(self.shot.hr.pattern),
             "output": os.path.abspath(str(self.shot.output)),  # a run that resumes may have another working directory
             "finished": finished,
@@ -128,7 +128,8 @@ class ShotReport:
 
 def result_of(frame: FrameFiles, status: str, message: str = "", exit_code: int = 0, **more: Any) -> FrameResult:
     """Return the result of a frame with its three paths; ``more`` are other fields of :class:`FrameResult`."""
-    lrhs, hrls = (None if path is None else str(path) for path in (frame.lr, frame.hr))
+    low = None if frame.lr == frame.hr else frame.lr
+    lrhs, hrls = (None if path is None else str(path) for path in (low, frame.hr))
     return FrameResult(frame.number, status, message, exit_code, lrhs=lrhs, hrls=hrls, output=str(frame.output), **more)
 
 

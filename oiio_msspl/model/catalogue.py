@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.model.contract import SCALES, SPREAD
+from oiio_msspl.model.contract import ONE_SIZE, SCALES, SPREAD
 from oiio_msspl.model.session import Session
 
 #: Folder of the models: ``NAME.onnx`` for each.
@@ -18,29 +18,30 @@ WEIGHTS = Path(__file__).parent / "weights"
 MEASURED = WEIGHTS / "measured.csv"
 #: Quality -> family of models, from the fastest to the most accurate.
 QUALITIES = {"fast": "joint-small", "balanced": "joint", "best": "joint-large"}
-#: The model that fuses two renders of one size, for passes at half of the frame's resolution; also with ``-spread``.
+#: The model that fuses passes at half of the frame's resolution, and nothing else; also with ``-spread``.
 MEAN_MODEL = "mean"
 #: The name that stands for the default quality.
 AUTO, DEFAULT_QUALITY = "auto", "balanced"
 
 
 def shipped_models() -> dict[str, Path]:
-    """Return the ONNX files of all models for pairs inside the package, by name (``paper-x4``)."""
-    return {path.stem: path for path in sorted(WEIGHTS.glob("*.onnx")) if not path.stem.endswith("-x1")}
+    """Return the ONNX files of all models for renders inside the package, by name (``paper-x4``)."""
+    return {path.stem: path for path in sorted(WEIGHTS.glob("*.onnx")) if not path.stem.startswith(MEAN_MODEL)}
 
 
 def digest(path: Path) -> str:
-    """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the weights files it names.
+    """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the weights that it reads.
 
     Args:
-        path: the ONNX file. Its weights files, ``*.weights``, lie beside it and are read in the order of their names.
+        path: the ONNX file. The other files, ``*.weights`` or models at x2, lie beside it and are read in the order of
+            their names.
 
     Raises:
         FileNotFoundError: the ONNX file or one of its weights files is missing.
     """
     content = path.read_bytes()
     made = hashlib.sha256(content)
-    for name in sorted(set(re.findall(rb"[\w.-]+\.weights", content))):
+    for name in sorted(set(re.findall(rb"[\w.-]+\.weights|[\w-]+-x2\.onnx", content))):
         made.update((path.parent / name.decode()).read_bytes())
     return made.hexdigest()[:12]
 
@@ -77,7 +78,7 @@ def find_model(scale: int, name: str | None = None) -> Path:
     """Return the ONNX file of a model.
 
     Args:
-        scale: 2, 4 or 8.
+        scale: 1 for one render or two of one size; 2, 4 or 8.
         name: a quality, ``auto`` or None for the default quality, a family (``paper``), a model (``paper-x4``), or an
             ONNX file.
 
@@ -92,9 +93,12 @@ def find_model(scale: int, name: str | None = None) -> Path:
             return models[model]
     if Path(name).is_file():
         return Path(name)
-    if scale not in SCALES:
-        raise InputError(f"there is no model for x{scale}; the scales are {', '.join(f'x{s}' for s in SCALES)}")
+    if scale not in (ONE_SIZE, *SCALES):
+        scales = ", ".join(f"x{s}" for s in (ONE_SIZE, *SCALES))
+        raise InputError(f"there is no model for x{scale}; the scales are {scales}")
     families = dict.fromkeys(model.rpartition("-x")[0] for model in models)
+    if name in families:  # the paper's method is about two sizes
+        raise InputError(f"the model {name} needs a low-resolution render; --quality takes one for renders of one size")
     raise InputError(f"no model {name!r}: neither a file nor one of {', '.join([*families, *models])}")
 
 

@@ -17,8 +17,9 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.model.encoding import KEY, MAX_ALBEDO, MAX_RADIANCE, MU
 from oiio_msspl.model.runtime import Network, load_network
 
-#: Upsampling factors from the LRHS to the HRLS.
+#: Upsampling factors from the LRHS to the HRLS; and the scale of one render, or of two renders of one size.
 SCALES = (2, 4, 8)
+ONE_SIZE = 1
 
 #: Ending of the names of models for renders whose pixel filter has spread the noise.
 SPREAD = "-spread"
@@ -47,7 +48,8 @@ class Contract:
       values that are too bright.
     - ``hrls.albedo`` and so on: further features, in the units of :mod:`oiio_msspl.aovs.features`.
     - ``exposure``: a number that multiplies radiance, see :func:`oiio_msspl.model.encoding.find_exposure`.
-    - ``share.rgb``: weight of the LRHS in the mean of both renders, in [0, 1], if the model denoises that mean.
+    - ``share.rgb``: weight of the LRHS in the mean of both renders, in [0, 1], if the model denoises that mean. It is
+      0 for one render, which is given as both.
       ``share.albedo`` and ``share.normal``: its weight for these features, if the model reads those of the LRHS.
 
     Output: ``fused`` (1, 3, s*h, s*w), scene linear, finite and >= 0. Some models also have ``log_error``
@@ -59,7 +61,7 @@ class Contract:
     name: str
     """Short name, e.g. ``paper-x4``."""
     scale: int
-    """Upsampling factor s: 2, 4 or 8; 1 for a model that fuses two renders of one size."""
+    """Upsampling factor s: 2, 4 or 8; ``ONE_SIZE`` for one render, or two of one size."""
     alignment: int = 1
     """Height and width of the LRHS input are multiples of this many pixels."""
     overlap: int = 24
@@ -157,6 +159,6 @@ class Contract:
         if contract.overlap % contract.alignment:
             multiple = f"an overlap of {contract.overlap} is no multiple of its alignment, {contract.alignment}"
             raise InputError(f"{source}: {multiple}; {again}")
-        if contract.scale not in (1, *SCALES):
-            raise InputError(f"{source}: scale {contract.scale} is none of {(1, *SCALES)}")
+        if contract.scale not in (ONE_SIZE, *SCALES):
+            raise InputError(f"{source}: scale {contract.scale} is none of {(ONE_SIZE, *SCALES)}")
         return contract

@@ -31,13 +31,14 @@ _DIFFERENT, _VARIANCE_OFFSET = 0.5, 4e-4
 _COMPARED_ROWS = 4
 
 
-def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float) -> Shares:
+def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float, share: float | None = None) -> Shares:
     """Decide how both renders of a frame are averaged. A frame has one answer, so that its tiles agree.
 
     Args:
         pairs: features of the LRHS and of the HRLS for parts of the frame, all equally large: ``rgb``, and ``albedo``
             and ``normal`` of the renders that have them.
         exposure: of the frame.
+        share: of ``rgb``, if it is known.
 
     Returns:
         The share of ``rgb``, and this share for each AOV of the LRHS that agrees with the HRLS's.
@@ -50,7 +51,8 @@ def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float) -> Shar
     def high(name: str) -> Array:
         return np.stack([box_downsample(_comparable(name, hrls[name]), scale) for _, hrls in pairs])
 
-    share = lrhs_share(*(encode_radiance(images, exposure) for images in (low(RGB), high(RGB))))
+    if share is None:
+        share = lrhs_share(*(encode_radiance(images, exposure) for images in (low(RGB), high(RGB))))
     shared = set(pairs[0][0]) & set(pairs[0][1])
     return {RGB: share} | {name: share for name in (ALBEDO, NORMAL) if name in shared and _agree(low(name), high(name))}
 

@@ -2,7 +2,6 @@
 """Measure accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
 
     python -m research.benchmarks.passes PASSES --table research/benchmarks/results/passes.csv
-    python -m research.benchmarks.passes PASSES --picture docs/images/passes.webp --scene cycles_10121_blackman_harris
 
 PASSES is made by :mod:`research.benchmarks.render.passes` and ``research.datagen.cycles.passes``. The methods:
 
@@ -39,13 +38,11 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
-from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import layer_names, light_of
 from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.image.arrays import Array
-from oiio_msspl.image.colour import srgb
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.catalogue import load_model
 from research.benchmarks import results, timer
@@ -137,32 +134,11 @@ def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
     return next(sets)
 
 
-def regraded(layers: Array) -> Array:
-    """Return the beauty with the first layer switched off, and four times the light of the second one."""
-    grades = np.array([0, 4, *[1] * (len(layers) - 2)], np.float32)
-    return np.einsum("i,ihwc->hwc", grades, layers)
-
-
 def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, tuple[FusedFrame, Session]]:
     """Return the fused frame of each model, and the model. That of single layers is loaded, too."""
     sessions = {model: load_model(scale, model) for model in (BALANCED, BEST)}
     sessions[BEST].layer_session  # noqa: B018 - loads it
     return {model: (fuse(lr, hr, session, clean_aovs=True), session) for model, session in sessions.items()}
-
-
-def picture(folder: Path, output: Path) -> None:
-    """Write a WebP: the light groups of a scene as rendered, fused and as they should be; below them the regraded
-    beauty."""
-    from PIL import Image
-
-    lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in ("lr_x4_32spp", "hr_2spp", "ref"))
-    layers = hr.additive_sets[0]
-    made = dict(methods(lr, hr, fused_frames(lr, hr, 4), layers))
-    columns = [made["HRLS"](), made["msspl"](), layers_of(reference, reference.additive_sets[0])]
-    rows = [*zip(*columns, strict=True), tuple(regraded(column) for column in columns)]
-    shown = np.concatenate([np.concatenate([srgb(image) for image in row], axis=1) for row in rows], axis=0)
-    with replacing(output, overwrite=True) as temporary:
-        Image.fromarray((shown * 255 + 0.5).astype(np.uint8)).save(temporary, format="WEBP", quality=80)
 
 
 def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
@@ -230,16 +206,12 @@ def means(rows: list[Row]) -> list[Row]:
 
 
 def main() -> None:
-    """Measure scenes, or draw one."""
+    """Measure scenes."""
     parser = results.parser(__doc__)
     parser.add_argument("passes", type=Path)
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
-    parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
     args = parser.parse_args()
     scenes = args.scene or sorted(file.parent.name for file in args.passes.glob("*/ref.exr"))
-    if args.picture:
-        picture(args.passes / scenes[0], args.picture)
-        return
     rows: list[Row] = []
     for scene, spp, scale in itertools.product(scenes, SPP, SCALES):
         measured = {tuple(row[key] for key in KEYS) for row in rows}

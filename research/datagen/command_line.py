@@ -12,6 +12,9 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
+#: Rendering stops when the disk has fewer bytes left.
+MIN_FREE = 15 * 2**30
+
 
 def _seeds(text: str) -> range:
     """``first``, ``first:last`` or ``first:last:step``; the last one is not included."""
@@ -28,11 +31,9 @@ def parser(module: str, description: str, ref_spp: int) -> argparse.ArgumentPars
     seeds = "first:last or first:last:step, last not included (0:400)"
     p.add_argument("--seeds", type=_seeds, default=range(0, 400), help=seeds)
     p.add_argument("--views", type=int, default=3, help="views per scene (%(default)s)")
-    p.add_argument("--assets", type=Path, help="folder with hdri/ and models/; without it all content is procedural")
     p.add_argument("--minutes", type=float, default=float("inf"), help="start no new scene after this time")
     p.add_argument("--threads", type=int, default=1, help="CPU threads (%(default)s)")
     p.add_argument("--ref-spp", type=int, default=ref_spp, help="spp of a reference; noisy ones get more (%(default)s)")
-    p.add_argument("--min-free", type=float, default=15.0, help="stop when the disk has fewer GiB left (%(default)s)")
     return p
 
 
@@ -48,7 +49,7 @@ def render_all(args: argparse.Namespace, render_scene: Callable[[int], tuple[int
         if time.monotonic() - start > args.minutes * 60:
             print("out of time")
             break
-        if shutil.disk_usage(args.out).free < args.min_free * 2**30:
+        if shutil.disk_usage(args.out).free < MIN_FREE:
             print("disk nearly full", file=sys.stderr)
             return 1
         before = time.monotonic()

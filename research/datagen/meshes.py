@@ -235,10 +235,10 @@ def blades(rng: Rng, roots: np.ndarray, length: float, width: float, bend: float
     return Mesh(v.reshape(-1, 3), f, np.stack([u, np.tile([0, 0, 0.5, 0.5, 1], k)], 1))
 
 
-def leaves(rng: Rng, centres: np.ndarray, size: float, drop: float = 0.5) -> Mesh:
+def leaves(rng: Rng, centres: np.ndarray, size: float) -> Mesh:
     """Return a pointed, folded leaf of random orientation on each of (K, 3) centres; u is random per leaf."""
     k = len(centres)
-    along = unit(rng.normal(size=(k, 3)) - (0, 0, drop)) * size * rng.uniform(0.5, 1.2, (k, 1))
+    along = unit(rng.normal(size=(k, 3)) - (0, 0, 0.5)) * size * rng.uniform(0.5, 1.2, (k, 1))
     across = unit(np.cross(along, rng.normal(size=(k, 3)))) * size * 0.3
     fold = np.cross(along, across) * (0.6 / size)
     v = np.stack(

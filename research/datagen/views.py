@@ -52,7 +52,6 @@ SIZE = 256
 HR_PASSES, LR_SPP = 8, (1, 1, 2, 4, 8)
 #: End of the names of views that keep single samples, and cells of their reference per pixel, along each side.
 SAMPLES_SUFFIX, REF_CELLS = ".samples.npz", 2
-SPLITS = ("train", "validation", "test")
 #: Pixel filters that a view's ``meta`` may name.
 FILTERS = ("box", "blackman-harris")
 

@@ -35,7 +35,7 @@ from research.training.render_mean import Images, mean_of_renders
 from research.training.tracing import traced
 
 #: Prefixes of tensors in the graph of a model.
-NETWORK, DENOISER = "network.", "denoiser."
+ENTER, NETWORK, DENOISER = "enter.", "network.", "denoiser."
 #: Tensors of fewer bytes, such as biases, stay in the graph.
 SMALL = 1024
 
@@ -53,16 +53,24 @@ class Enter(nn.Module):
         Returns:
             The LRHS and HRLS, and with a denoiser :func:`research.training.render_mean.mean_of_renders`.
         """
+        lrhs, hrls, shares = self.exposed(inputs)
+        renders = log_encode(lrhs[RGB]), encoded(hrls)
+        return (*renders, *mean_of_renders(lrhs, hrls, shares)) if self.contract.denoiser else renders
+
+    def exposed(self, inputs: Sequence[Tensor]) -> tuple[Images, Images, Images]:
+        """Return the exposed features of the LRHS and of the HRLS, and the LRHS's shares in their mean."""
         given = dict(zip(self.contract.inputs, inputs, strict=True))
         lrhs, hrls = (
             {name: exposed_feature(name, given[f"{render}.{name}"], given["exposure"]) for name in names}
             for render, names in (("lrhs", self.contract.lrhs), ("hrls", self.contract.hrls))
         )
-        encoded = log_encode(lrhs[RGB]), torch.cat([encoded_feature(*item) for item in hrls.items()], dim=1)
-        if not self.contract.denoiser:
-            return encoded
-        shares: Images = {name: given[f"share.{name}"] for name in self.contract.lrhs}
-        return *encoded, *mean_of_renders(lrhs, hrls, shares)
+        shares = {name: given[f"share.{name}"] for name in self.contract.lrhs if self.contract.denoiser}
+        return lrhs, hrls, shares
+
+
+def encoded(features: Images) -> Tensor:
+    """Encode and stack exposed features."""
+    return torch.cat([encoded_feature(*item) for item in features.items()], dim=1)
 
 
 class Leave(nn.Module):
@@ -107,7 +115,7 @@ class _Whole(Nodes):
         names = ["lrhs", "hrls", *(["colour", "noise", "albedo", "normal"] if denoiser is not None else [])]
         inputs = example(contract, 4 * contract.alignment, 6 * contract.alignment)
         enter = traced(Enter(contract), (list(inputs.values()),), list(inputs), names, contract.alignment)
-        self.embed(enter, "enter.", {name: f"encoded.{name}" for name in names})
+        self.embed(enter, ENTER, {name: f"encoded.{name}" for name in names})
         lrhs, hrls, *mean = (f"encoded.{name}" for name in names)
         if denoiser is not None:
             self._denoise(denoiser, mean)
@@ -213,9 +221,9 @@ def save(models: Mapping[Path, onnx.ModelProto], family: str = "") -> None:
     for mode in DENOISERS:
         group = [model for model in models.values() if _contract(model).denoiser == mode]
         if group:
-            _share_weights(group, folder / f"{denoiser_file(mode)}.weights", DENOISER)
+            share_weights(group, folder / f"{denoiser_file(mode)}.weights", DENOISER)
     if family:
-        _share_weights(list(models.values()), folder / f"{family}.weights", NETWORK)
+        share_weights(list(models.values()), folder / f"{family}.weights", NETWORK)
     for path, model in models.items():
         onnx.save(model, path)
 
@@ -224,8 +232,8 @@ def _contract(model: onnx.ModelProto) -> Contract:
     return Contract.from_json(next(item.value for item in model.metadata_props if item.key == METADATA_KEY), "model")
 
 
-def _share_weights(models: Sequence[onnx.ModelProto], file: Path, prefix: str) -> None:
-    """Move weights whose names begin with ``prefix`` into one file, equal ones once."""
+def share_weights(models: Sequence[onnx.ModelProto], file: Path, prefix: str = "") -> None:
+    """Move weights that are in the models and whose names begin with ``prefix`` into one file, equal ones once."""
     places: dict[bytes, int] = {}
     with file.open("wb") as out:
         for model in models:

@@ -76,6 +76,20 @@ def test_albedo_and_normal_without_noise_can_be_asked_for(files):
     assert [f"albedo.{c}" for c in "RGB"] in names
 
 
+def test_what_the_renders_bring_back_can_be_seen_and_left_out(files):
+    pair = files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--no-preview", "--quality", "fast"
+    done = fuse(*pair, "--trust-layer", "--json")
+    assert done.returncode == 0, done.stderr
+    layer = next(part for part in open_exr(files / "out.exr").parts if part.name == "trust")
+    assert [channel.name for channel in layer.channels] == ["trust.Y"]
+    assert 0 <= json.loads(done.stdout)["trust"] <= 1
+    done = fuse(*pair, "--trust", "off", "--json", "--overwrite")
+    assert json.loads(done.stdout)["trust"] is None
+    assert open_exr(files / "out.exr").parts[0].attributes["msspl/trust"] == "off"
+    refused = fuse(*pair, "--trust", "maybe", "--overwrite")
+    assert refused.returncode == 2 and "--trust 'maybe': use on or off" in refused.stderr
+
+
 def test_the_report_for_machines(files, bilinear_models):
     done = fuse(
         files / "lr.exr",

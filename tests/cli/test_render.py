@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from msspl_cli.blender_process import command, find_blender
@@ -237,7 +238,7 @@ def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, 
     monkeypatch.setattr(read, "_read_pixels", lambda frame: loaded.append(load(frame) or frame))
     monkeypatch.setattr(memory, "_vector_bytes", lambda hr, channels: counted.append(channels) or counts(hr, channels))
     frames = [FrameFiles(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
-    shot = RenderedShot(Settings(model=str(bilinear_models[4])), frames, frames, TemporalOptions("auto"))
+    shot = RenderedShot(Settings(model=str(bilinear_models[4])), 4, frames, frames, TemporalOptions("auto"))
     for frame in shot.order:
         pair = [moving / f"{render}/{render}.{frame.number}.exr" for render in ("lr", "hr")]
         shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))
@@ -521,14 +522,15 @@ def test_a_blender_that_ends_while_its_frame_is_fused_is_named(farm, model):
 def test_the_bar_covers_the_whole_run(monkeypatch):
     """It grows from frame to frame, and each render is a third of a frame."""
     told = []
-    printer = _Printer(quiet=False, verbose=False, count=2)
+    shot = SimpleNamespace(order=[1, 2], waits=lambda output: True)
+    printer = _Printer(shot, quiet=False, verbose=False, keep=False)
     monkeypatch.setattr(printer._bar, "update", lambda label, done, total: told.append((label, done / total)))
     for frame in (1, 2):
         for step, fraction in (("LRHS", 0.0), ("HRLS", 1 / 3), ("fuse", 2 / 3)):
             printer.show({"frame": frame, "step": step, "fraction": fraction})
             if step != "fuse":
                 printer.show({"samples": 0.5})
-        printer.show({"report": {}})
+        printer.show({"report": {"output": "out.exr"}})
     shares = [share for _, share in told]
     assert shares == pytest.approx([k / 12 for k in (0, 1, 2, 3, 4, 6, 7, 8, 9, 10)])
     assert told[-1][0] == "frame 2: fuse"

@@ -757,3 +757,41 @@ def test_alpha_does_not_depend_on_layers_of_light():
         for layers in ({}, light)
     )
     np.testing.assert_array_equal(one, other)
+
+
+def detailed_pair(side=128):
+    """A checker that no AOV shows, with hardly any noise."""
+    y, x = np.mgrid[:side, :side]
+    clean = picture(side, side) * (1 + 0.4 * (-1.0) ** (x + y))[..., None]
+    low, high = (noisy(values, 4000, seed=seed) for seed, values in enumerate((downsample(clean, 2), clean)))
+    return renders(low, high), clean
+
+
+def test_detail_that_both_renders_show_comes_back_unless_it_is_not_wanted():
+    pair, clean = detailed_pair()
+    session = Session(find_model(2, "joint-small"))
+    trusted, alone = fuse(*pair, session), fuse(*pair, session, trust=False)
+    errors = [np.abs(frame.rgb - clean).mean() / clean.mean() for frame in (trusted, alone)]
+    assert errors[0] < 0.05 < 0.2 < errors[1]
+    assert trusted.trust.shape == (64, 64) and trusted.trust.mean() > 0.8
+    assert trusted.trust_pixels().shape == (128, 128, 1)
+    assert alone.trust is None and not alone.trust_pixels().any()
+
+
+def test_what_comes_back_has_no_seam_between_tiles(monkeypatch):
+    pair, _ = detailed_pair(256)
+    session = Session(find_model(2, "joint-small"))
+    whole = fuse(*pair, session)
+    tiles_of(monkeypatch, session, 192 * 192)
+    tiled = fuse(*pair, session)
+    assert tiled.tiles > 1
+    assert np.abs(tiled.rgb - whole.rgb).max() < 0.02 * whole.rgb.max()
+
+
+def test_an_lrhs_with_the_noise_of_the_hrls_brings_no_noise_back():
+    clean = picture(256, 256)
+    high = noisy(clean, 4)
+    pair = renders(downsample(high, 2), high)
+    frame = fuse(*pair, Session(find_model(2, "joint-small")))
+    assert frame.trust is None
+    assert any("the LRHS has the noise of the HRLS" in warning for warning in frame.warnings)

@@ -832,7 +832,7 @@ def test_update_says_that_a_date_lies_in_the_future(tmp_path, bilinear_models, c
 
 def test_results_do_not_lie_among_the_low_resolution_renders(tmp_path, bilinear_models):
     folder = make_shot(tmp_path, 1)
-    with pytest.raises(InputError, match="lr: holds the low-resolution renders; name another folder"):
+    with pytest.raises(InputError, match="lr: holds renders that this run reads; name another folder"):
         fuse_shot(folder / "lr", folder / "hr", folder / "lr", model=str(bilinear_models[4]))
     report = fuse_shot(folder / "lr", folder / "hr", folder / "lr" / "out.####.exr", model=str(bilinear_models[4]))
     assert report.exit_code == 0

@@ -23,15 +23,19 @@ WITH_DENOISER = [name for name in shipped_models() if name.startswith("joint")]
 
 @pytest.mark.parametrize("name", shipped_models())
 def test_weights_that_models_share_lie_beside_them(name):
-    """Those of the denoiser, which is another one for spread noise; all scales of the large size share its weights."""
+    """Those of the denoiser, which is another one for spread noise; all scales of the large size share its weights. The
+    models for renders of one size have those of x2."""
     onnx = pytest.importorskip("onnx")
     model = onnx.load(WEIGHTS / f"{name}.onnx", load_external_data=False)
     files = {entry.value for t in model.graph.initializer for entry in t.external_data if entry.key == "location"}
     noise = "_spread" if "-spread-" in name else ""
-    small = "_small" if name.startswith("joint-small") and name.endswith("x2") else ""
+    family, _, scale = name.rpartition("-x")
+    small = "_small" if name.startswith("joint-small") and scale in "12" else ""
     expected = set() if name.startswith("paper") else {f"mean_denoiser{small}{noise}.weights"}
     if name.startswith("joint-large"):
         expected.add(f"joint-large{noise.replace('_', '-')}.weights")
+    elif name.startswith("joint") and scale == "1":
+        expected.add(f"{family}-x2.onnx")
     assert files == expected
     assert all((WEIGHTS / file).is_file() for file in files)
 

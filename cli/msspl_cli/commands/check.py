@@ -28,8 +28,7 @@ EXAMPLES = """[bold]Examples[/bold]
 
 
 def check(
-    lr: options.LowRender,
-    hr: options.HighRender,
+    renders: options.Renders,
     mapping: options.Map = [],  # noqa: B006
     map_file: options.MapFile = None,
     view_layer: options.ViewLayer = None,
@@ -39,7 +38,7 @@ def check(
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
 ) -> None:
-    """Tell whether two renders fit, without fusing them.
+    """Tell whether a render can be fused, or whether two fit, without fusing them.
 
     A pair does not fit if it can't be fused, or if the two renders do not seem to
     show the same frame: another camera, light, colour space, albedo or normal.
@@ -49,10 +48,12 @@ def check(
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None, colorspace)
     pairs: list[tuple[int | None, PairCheck]] = []
-    if is_sequence(lr) or is_sequence(hr):
+    lr, hr = options.low_and_high(renders)
+    if any(is_sequence(path) for path in renders):
         shot = find_shot(lr, hr, Path(), frames)
         for frame in shot.frames:
-            low, high = frame.lr or shot.lr.pattern.path(frame.number), frame.hr or shot.hr.pattern.path(frame.number)
+            high = frame.hr or shot.hr.pattern.path(frame.number)
+            low = None if lr is None else frame.lr or shot.lr.pattern.path(frame.number)
             pairs.append((frame.number, check_files(low, high, inputs)))
             _print(*pairs[-1], as_json)
     elif frames:
@@ -71,7 +72,8 @@ def _print(number: int | None, pair: PairCheck, as_json: bool) -> None:
     """Print the outcome of a pair, unless JSON is printed in the end."""
     if as_json:
         return
-    name = f"{pair.lr} and {pair.hr}" if number is None else f"frame {number}"
+    files = f"{pair.hr}" if pair.lr is None else f"{pair.lr} and {pair.hr}"
+    name = files if number is None else f"frame {number}"
     if pair.problem is not None:
         console.say(f"{name}: can't be fused: {pair.problem}")
     else:

@@ -26,7 +26,14 @@ if TYPE_CHECKING:
 
     from oiio_msspl.jobs.report import FrameReport
 
+#: LRHS, HRLS and output; None and the only render in front, if there is one.
+Files = tuple[Path | None, Path, Path]
+
 EXAMPLES = """[bold]Examples[/bold]
+
+  msspl-fuse hr.exr -o out.exr
+
+  msspl-fuse seed1.exr seed2.exr -o out.exr
 
   msspl-fuse lr.exr hr.exr -o out.exr
 
@@ -60,8 +67,7 @@ _COMPRESSION = "Compress the fused layer by zip, htj2k256, dwaa, ... \\[default:
 
 
 def fuse(
-    lr: options.LowRender,
-    hr: options.HighRender,
+    renders: options.Renders,
     *,
     # Input
     mapping: options.Map = [],  # noqa: B006
@@ -90,6 +96,8 @@ def fuse(
     passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
     data_passes: options.DataPasses = False,
+    trust: options.Trust = "on",
+    trust_layer: options.TrustLayer = False,
     compression: Annotated[str | None, option(OUTPUT, _COMPRESSION, metavar="NAME", hidden=True)] = None,
     half: Annotated[
         bool | None, option(OUTPUT, "Set the fused layer's type. \\[default: as HR]", "--half/--float", hidden=True)
@@ -125,11 +133,14 @@ def fuse(
     help_all: options.HelpAll = False,
     version: options.Version = False,
 ) -> None:
-    """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
+    """Remove the noise of a render, or of two renders of the same frame together.
+
+    Two renders have a noise seed each. They are a low-resolution, high-spp render
+    LR and a high-resolution, low-spp render HR, or two renders of the same size.
 
     OUT gets the fused beauty and passes, and every other layer of HR unchanged.
-    The scale (x2, x4, x8) follows from the two display windows. Layers are found
-    under the names that renderers give them; --map names others.
+    The scale (x1, x2, x4, x8) follows from the two display windows. Layers are
+    found under the names that renderers give them; --map names others.
 
     With folders or patterns it fuses a shot: frames are paired by number, and a
     bad frame does not stop the others.
@@ -140,12 +151,13 @@ def fuse(
     from oiio_msspl.jobs.sequence import check_exists, is_sequence
     from oiio_msspl.jobs.settings import bytes_of
 
-    for path in (lr, hr):
+    lr, hr = options.low_and_high(renders)
+    for path in renders:
         check_exists(path)
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
         "write": options.make_write_options(
-            layout, compression, half, layers, error_layer, passes, frames_layer, data_passes
+            layout, compression, half, layers, error_layer, passes, frames_layer, data_passes, trust, trust_layer
         ),
         "model": options.choose_model(model, quality),
         "device": device,
@@ -156,7 +168,7 @@ def fuse(
     }
     over_time = TemporalOptions(temporal, motion_format)
     use_threads(threads)
-    if is_sequence(lr) or is_sequence(hr):
+    if any(is_sequence(path) for path in renders):
         if debug:
             logging.getLogger("oiio_msspl.jobs.shot").setLevel(logging.DEBUG)  # the traceback of each failed frame
         printer = ShotPrinter(verbose, quiet, as_json, progress)
@@ -180,7 +192,7 @@ def fuse(
     _fuse_pair((lr, hr, output), verbose, quiet, as_json, preview_path=png, **common)
 
 
-def _fuse_shot(files: tuple[Path, Path, Path], scheduler: str | None, printer: ShotPrinter, **settings: Any) -> None:
+def _fuse_shot(files: Files, scheduler: str | None, printer: ShotPrinter, **settings: Any) -> None:
     """Fuse a shot, on a Dask cluster if ``--scheduler`` names one, and exit with its code."""
     from oiio_msspl.jobs.shot import fuse_shot
 
@@ -197,7 +209,7 @@ def _fuse_shot(files: tuple[Path, Path, Path], scheduler: str | None, printer: S
     raise typer.Exit(report.exit_code)
 
 
-def _fuse_pair(files: tuple[Path, Path, Path], verbose: int, quiet: bool, as_json: bool, **settings: Any) -> None:
+def _fuse_pair(files: Files, verbose: int, quiet: bool, as_json: bool, **settings: Any) -> None:
     """Fuse a single frame, and print its report."""
     from oiio_msspl.jobs.files import fuse_files
 
@@ -221,7 +233,8 @@ def _print(report: FrameReport, seconds: float) -> None:
     """Print which layers were used, what was repaired, and the time of each stage."""
     from oiio_msspl.aovs.views import name_of
 
-    renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
+    kind = "render" if report.is_one_render else "pair"
+    renderer = kind.capitalize() if report.hr.renderer == "unknown" else f"{report.hr.renderer} {kind}"
     average = "" if report.spp_avg is None else f", {report.spp_avg:g} spp on average"
     fused = [name_of(view.hr.view) for view in report.fused_views()]
     rest = [name for name in map(name_of, report.hr.other_views) if name not in fused]
@@ -238,6 +251,8 @@ def _print(report: FrameReport, seconds: float) -> None:
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
     for name, outcome in report.passes.items():
         console.say(f"  {name}: {outcome}")
+    if report.trust is not None and report.trust >= 0.005:
+        console.say(f"Put back {report.trust:.0%} of what the network had removed: both renders show it.")
     for text, counts in (
         ("Repaired values that were NaN or infinite", report.repaired),
         ("Set negative values to 0 (colours out of gamut)", report.negative),

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +16,9 @@ from msspl_cli.options import INPUT, OUTPUT, SHOT, option
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr import atomic
 from oiio_msspl.image.parallel import MOST_THREADS
+
+if TYPE_CHECKING:
+    from oiio_msspl.jobs.blender_source import RenderedShot
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -79,6 +82,8 @@ def render(
     passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
     data_passes: options.DataPasses = False,
+    trust: options.Trust = "on",
+    trust_layer: options.TrustLayer = False,
     keep: Annotated[
         bool, option(OUTPUT, "Keep both renders beside OUT: OUT_lr.exr, OUT_hr.exr.", "--keep", hidden=True)
     ] = False,
@@ -104,10 +109,11 @@ def render(
     """
     if not scene.is_file():
         raise InputError(f"{scene}: no such file")
-    from msspl_cli.rendered_frames import RenderedFrames, beside
     from oiio_msspl.exr.reader import use_threads
+    from oiio_msspl.jobs.blender_source import RenderedShot, beside
     from oiio_msspl.jobs.plan import TemporalOptions
-    from oiio_msspl.jobs.settings import bytes_of
+    from oiio_msspl.jobs.sequence import FrameFiles
+    from oiio_msspl.jobs.settings import Settings, bytes_of
     from oiio_msspl.model.contract import SCALES
 
     for name, value, choices in (("--scale", scale, SCALES), ("--filter", pixel_filter, ("box", "scene"))):
@@ -124,24 +130,27 @@ def render(
     ]
     _check_files(scene, output, targets, extras, overwrite=overwrite, skip_existing=skip_existing)
     use_threads(threads)
-    fused = RenderedFrames(
-        shot,
-        targets,
-        scale,
-        over_time,
-        keep=keep,
-        write=options.make_write_options(layout, None, None, [], error_layer, passes, data_passes=data_passes),
+    settings = Settings(
+        write=options.make_write_options(
+            layout, None, None, [], error_layer, passes, False, data_passes, trust, trust_layer
+        ),
         model=options.choose_model(model, quality),
         device=device,
         threads=threads,
         max_memory=bytes_of(max_memory),
         overwrite=overwrite,
     )
+    # A scene without a number is one frame, numbered 0.
+    files = {path: FrameFiles(number or 0, None, None, path.absolute()) for number, path in shot}
+    wanted = [files[path] for path in targets]
+    fused = RenderedShot(settings, scale, list(files.values()), wanted, over_time, keep=keep)
+    results = {frame.number: str(frame.output) for frame in wanted}
     job = {
         "scene": str(scene.absolute()),
         "scene_name": scene_name,
-        # Without a range, there is one frame: that at which the scene was saved.
-        "frames": [(None if frames is None else number, result) for number, result in fused.order],
+        # Without a range, there is one frame: that at which the scene was saved. A frame without a result is rendered
+        # for its neighbours.
+        "frames": [(None if frames is None else frame.number, results.get(frame.number)) for frame in fused.order],
         "options": {
             "scale": scale,
             "hr_spp": hr_spp,
@@ -158,19 +167,20 @@ def render(
     atomic.make_folder(output.parent)
     atomic.remove_leftovers(path for _, path in shot)
     atomic.remove_left_folders(output.parent)
-    printer = _Printer(quiet, bool(verbose), len(fused.order))
+    printer = _Printer(fused, quiet, verbose=bool(verbose), keep=keep)
 
     def show(event: dict[str, Any]) -> None:
-        fused.take(event)
+        if "no_vectors" in event:
+            fused.fuse_alone(event["no_vectors"])
+        if "size" in event:
+            fused.check(event["size"], event["layers"], event["pixel_bytes"])
         printer.show(event)
-        printer.add(fused.written())
 
     try:
         if targets:
             render_frames(program, scene, job, output.parent, show, fused.fuse, verbose=bool(verbose))
     finally:
-        printer.add(fused.written())  # frames that are written are reported even if a later one failed
-        printer.end(as_json, fused.text, alone=not fused.averages)
+        printer.end(as_json)
     if not (targets or as_json or quiet):
         print(f"{output}: every frame exists")
 
@@ -224,40 +234,56 @@ def _check_files(
 class _Printer:
     """The progress and the reports of a shot, as they are printed."""
 
-    def __init__(self, quiet: bool, verbose: bool, count: int) -> None:
-        self._quiet, self._bar, self._label = quiet, console.ProgressBar(shown=not quiet and not verbose), ""
-        #: Frames of the run, those that are done, and the fraction of the current one that is done.
-        self._count, self._done, self._fraction = count, 0, 0.0
+    def __init__(self, shot: RenderedShot, quiet: bool, *, verbose: bool, keep: bool) -> None:
+        self._shot, self._quiet, self._keep = shot, quiet, keep
+        self._bar, self._label = console.ProgressBar(shown=not quiet and not verbose), ""
+        #: Frames that are done, and the fraction of the current one that is done.
+        self._done, self._fraction = 0, 0.0
         self._reports: list[dict[str, Any]] = []
+        self._waiting: list[dict[str, Any]] = []  # reports of frames that wait for their neighbours
+        self._warnings: list[str] = []  # about all frames
 
     def show(self, event: dict[str, Any]) -> None:
-        """Show the step that Blender works on."""
+        """Show the step that Blender works on, and what was written."""
+        if "warning" in event:
+            self._warnings.append(event["warning"])
         if "step" in event:
             number = event.get("frame")
             self._label = event["step"] if number is None else f"frame {number}: {event['step']}"
             self._fraction = event.get("fraction", 0.0)
         if "report" in event:
+            self._waiting.append(event["report"])
             self._done, self._fraction = self._done + 1, 0.0
         else:  # each render is a third of the work
-            self._bar.update(self._label, self._done + self._fraction + event.get("samples", 0) / 3, self._count)
+            done = self._done + self._fraction + event.get("samples", 0) / 3
+            self._bar.update(self._label, done, len(self._shot.order))
+        self._add_written()
 
-    def add(self, reports: Sequence[dict[str, Any]]) -> None:
+    def _add_written(self) -> None:
         """Keep the reports of frames that are written, and print their warnings."""
-        for report in reports:
+        from oiio_msspl.jobs.blender_source import beside
+
+        while self._waiting and not self._shot.waits(result := Path(self._waiting[0]["output"])):
+            report = self._waiting.pop(0)
+            report["temporal"] = self._shot.text
+            report["warnings"] += [*self._warnings, *self._shot.warnings(result)]
+            for render, suffix in (("lrhs", "lr"), ("hrls", "hr")):
+                report[render]["file"] = str(beside(result, suffix)) if self._keep else None
             self._reports.append(report)
             self._bar.hide()
             for warning in () if self._quiet else report["warnings"]:
                 console.say(f"warning: frame {report['frame']}: {warning}", error=True)
 
-    def end(self, as_json: bool, fused: str, *, alone: bool) -> None:
+    def end(self, as_json: bool) -> None:
         """Print the reports: as JSON, or the times as a table, and how frames were averaged."""
+        self._add_written()  # they are reported even if a later frame failed
         self._bar.hide()
         if as_json:
             print(json.dumps(self._reports, indent=2))
         elif self._reports and not self._quiet:
-            _print_times(self._reports, alone=alone)
-            if fused:
-                print(f"Fused {fused}")
+            _print_times(self._reports, alone=not self._shot.averages)
+            if self._shot.text:
+                print(f"Fused {self._shot.text}")
 
 
 def _print_times(reports: Sequence[dict[str, Any]], *, alone: bool) -> None:

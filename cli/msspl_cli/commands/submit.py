@@ -15,7 +15,7 @@ from oiio_msspl.errors import InputError
 
 #: The command accepts arguments that it does not know. msspl-fuse's own parser reads them.
 SETTINGS = {"allow_extra_args": True, "ignore_unknown_options": True}
-USAGE = "LR HR -o OUT --bundle DIR [OPTION]..."
+USAGE = "[LR] HR -o OUT --bundle DIR [OPTION]..."
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -29,10 +29,10 @@ EXAMPLES = """[bold]Examples[/bold]
 """
 
 #: Parameters of msspl-fuse that :func:`oiio_msspl.jobs.farm.openjd.make_job` takes itself, or that every task has.
-_TAKEN = {"lr", "hr", "output", "frames", "model", "quality", "map_file", "device", "view", "skip_existing"}
+_TAKEN = {"renders", "output", "frames", "model", "quality", "map_file", "device", "view", "skip_existing"}
 #: Parameters of msspl-fuse that a job can't have: a task skips existing frames and reports to the farm.
 _REFUSED = {"overwrite", "report_file", "progress", "as_json", "scheduler"}
-_PATHS = ("lr", "hr", "output", "map_file")
+_PATHS = ("output", "map_file")
 
 
 def submit(
@@ -75,14 +75,15 @@ def submit(
     # A wrong value is refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
-    written = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
-    write = options.make_write_options(**{name: given[name] for name in written})
+    written = ("layout", "compression", "half", "layers", "passes", "trust")
+    added = ("error_layer", "frames_layer", "trust_layer", "data_passes")
+    write = options.make_write_options(**{name: given[name] for name in (*written, *added)})
     temporal = TemporalOptions(given["temporal"], given["motion_format"])
     max_memory = bytes_of(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
     settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view")}
     settings |= {"inputs": inputs, "model": model, "options": passed_on, "chunk": chunk, "timeout": timeout}
-    job = make_job(given["lr"], given["hr"], given["output"], **settings)
+    job = make_job(*options.low_and_high(given["renders"]), given["output"], **settings)
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
     with limit_threads(given["threads"]):
         check_temporal(job.shot, inputs, temporal, model, write)
@@ -136,7 +137,8 @@ def _parse(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
                 passed_on += [parameter.opts[0], _full_path(text) if name == "mapping" else str(text)]
     # Some versions of typer convert paths only when they call the command.
     paths = {name: Path(context.params[name]) for name in _PATHS if context.params[name] is not None}
-    return context.params | paths, passed_on
+    renders = [Path(path) for path in context.params["renders"]]
+    return context.params | paths | {"renders": renders}, passed_on
 
 
 def _full_path(mapping: str) -> str:

@@ -26,6 +26,7 @@ from oiio_msspl.image.arrays import Array, planes_of, quantile
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import for_row_blocks, in_background
+from oiio_msspl.model.contract import ONE_SIZE
 
 #: Two renders hardly show the same frame if the correlation of their log luminance is below this. Matching pairs with
 #: clean references reach 0.83 to 0.99, one lit almost only by fireflies 0.31, different scenes -0.2 to 0.25.
@@ -54,6 +55,9 @@ BLOCK = 4
 #: The LRHS has the noise of the HRLS if, in three of four blocks, they differ by less than this fraction of the HRLS's
 #: noise. Independent renders differ by the noise of both, so by more than 1.
 SAME_NOISE = 0.75
+#: Both renders are equal in a block if they differ by this fraction of its brightness, RMS. Independent renders of
+#: thousands of spp differ by more.
+EQUAL = 0.002
 #: A block has noise if its RMS is this fraction of the block's brightness.
 NOISY = 0.01
 #: Noise is not compared if there are fewer noisy blocks.
@@ -133,7 +137,7 @@ class HrlsAverages:
             mean = box_downsample(samples, scale)
             averages[rows] = luminance(mean)
             pixels, grey = luminance(samples), luminance(colour)
-            expected = box_downsample(_noise_variance(pixels), scale // 2) / np.float32(scale**2)
+            expected = _noise_variance(pixels, scale) / np.float32(scale**2)
             # Black pixels are equal in any two renders where light is rare.
             noisy = (grey > 0) & (expected > np.square(np.float32(5 * NOISY) * grey))
             nearest = reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - grey) for i, j in phases))
@@ -161,18 +165,22 @@ def _edge_lengths(normal: Array) -> Array:
 
 def _noise_of_edges(pixels: Array, scale: int) -> Array:
     """Return :func:`_edge_lengths` of constant normals with the noise of the HRLS's (s*h, s*w, 3), RMS, (h, w)."""
-    variance = reduce(np.add, planes_of(_noise_variance(pixels)))
+    variance = reduce(np.add, planes_of(_noise_variance(pixels, scale)))
     # Means over scale x scale pixels, in two differences of two of them each.
-    noise: Array = np.sqrt(box_downsample(variance, scale // 2)) * np.float32(2 / scale)
+    noise: Array = np.sqrt(variance) * np.float32(2 / scale)
     return noise
 
 
-def _noise_variance(pixels: Array) -> Array:
-    """Estimate the variance of noise (h / 2, w / 2, ...) from 2 x 2 pixels each."""
+def _noise_variance(pixels: Array, scale: int) -> Array:
+    """Estimate the variance of noise (h, w, ...) of the HRLS's pixels (s*h, s*w, ...) from 2 x 2 pixels each."""
     # Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
-    a, b, c, d = (pixels[i::2, j::2] for i in (0, 1) for j in (0, 1))
+    if scale == ONE_SIZE:  # each pixel, with those to the right and below
+        pixels = np.pad(pixels, [(0, 1), (0, 1), *[(0, 0)] * (pixels.ndim - 2)], mode="edge")
+        a, b, c, d = (pixels[i : len(pixels) - 1 + i, j : pixels.shape[1] - 1 + j] for i in (0, 1) for j in (0, 1))
+    else:
+        a, b, c, d = (pixels[i::2, j::2] for i in (0, 1) for j in (0, 1))
     variance: Array = np.square(a - b - c + d) / np.float32(4)
-    return variance
+    return box_downsample(variance, scale // 2) if scale > 2 else variance
 
 
 def _hrls_pixels(pair: TileFeatures, feature: str, window: Window) -> Array:
@@ -208,8 +216,17 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
         hrls: averages of all tiles.
 
     Raises:
-        InputError: one render is black, most likely a wrong layer, and the other one is lit by more than chance.
+        InputError: one render is black, most likely a wrong layer, and the other one is lit by more than chance. Or two
+            renders of one size have the same noise, so that there is nothing to gain from the second one.
     """
+    warnings = _find_doubts(low, hrls, lr_name, hr_name)
+    if hrls.alignment.scale != ONE_SIZE:
+        return warnings
+    return [text.replace("LRHS", "first render").replace("HRLS", "second render") for text in warnings]
+
+
+def _find_doubts(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> list[str]:
+    """Return the warnings of :func:`check_pair`, which call the renders LRHS and HRLS."""
     high, alignment = hrls.rgb, hrls.alignment
     if not low.any() and not high.any():
         return [BOTH_BLACK]
@@ -228,6 +245,8 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
     framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
     if _has_same_noise(hrls):
+        if alignment.scale == ONE_SIZE:
+            raise InputError(f"{lr_name} and {hr_name} have the same noise; render each with a noise seed of its own")
         warnings.append(
             "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "
             "with more spp, and not made by scaling the HRLS down"
@@ -285,6 +304,15 @@ def _is_region(black: Array, lit: Array) -> bool:
     outside[max(rows[0] - 2, 0) : rows[-1] + 3, max(columns[0] - 2, 0) : columns[-1] + 3] = False
     lit_pixels = np.count_nonzero(lit[outside])
     return bool(lit_pixels > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
+
+
+def are_not_independent(hrls: HrlsAverages) -> bool:
+    """Return whether the LRHS equals the means of the HRLS where the HRLS varies, so that it shows no noise."""
+    brightness, difference, expected = hrls.blocks[..., :6].sum(axis=-1) / 6, hrls.blocks[..., 6], hrls.blocks[..., 7]
+    varied = expected * BLOCK**2 > np.square(NOISY * brightness)
+    equal = varied & (difference * BLOCK**2 < np.square(EQUAL * brightness))
+    count = int(np.count_nonzero(varied))
+    return count >= MIN_NOISY_BLOCKS and 4 * int(np.count_nonzero(equal)) > 3 * count
 
 
 def _has_same_noise(hrls: HrlsAverages) -> bool:

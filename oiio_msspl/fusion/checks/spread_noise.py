@@ -32,6 +32,9 @@ CACHE_BYTES = 256 << 20
 #: Noise is spread if neighbouring pixels of the HRLS, and of the difference between both renders, correlate by more.
 #: A box filter or importance sampling has 0 in both; Mitsuba's default, a Gaussian, has 0.3 and at least 0.04.
 SPREAD_HRLS, SPREAD_DIFFERENCE = 0.15, 0.02
+#: Of one render, this share of the blocks may correlate by less. Texture makes up to half of the blocks of a render of
+#: 64 spp correlate by more.
+LEAST_CORRELATED = 0.25
 
 
 def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool | None:
@@ -39,7 +42,8 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
 
     Fine texture in the HRLS also makes neighbours alike. It cancels in the difference of the LRHS and the averaged
     HRLS, and noise does not. So neighbours must correlate in the HRLS and in this difference. Small samples all over
-    the frame are read.
+    the frame are read. One render, which is given as both, has no difference: nearly all of its blocks must correlate,
+    also those without texture.
     """
     scale, correlations = alignment.scale, []
     with hr.cache_strips(CACHE_BYTES):
@@ -54,6 +58,8 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
             )
             correlations.append((_correlations(high), _correlations(low - mean)))
     hrls, difference = (np.concatenate(parts) for parts in zip(*correlations, strict=True))
+    if lr is hr:
+        return None if len(hrls) < FEWEST else bool(np.quantile(hrls, LEAST_CORRELATED) > SPREAD_HRLS)
     if min(len(hrls), len(difference)) < FEWEST:
         return None
     return bool(np.median(hrls) > SPREAD_HRLS and np.median(difference) > SPREAD_DIFFERENCE)

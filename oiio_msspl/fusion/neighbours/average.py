@@ -61,8 +61,8 @@ def average_renders(
         features: which features the result has, if the renders have them; all if None.
 
     Returns:
-        The LRHS, the HRLS, and the number of frames with equal weight whose mean would have the same noise, (h, w, 1)
-        over the HRLS's data window: 1 where the frame stands alone.
+        The LRHS, the HRLS (one render is both), and the number of frames with equal weight whose mean would have the
+        same noise, (h, w, 1) over the HRLS's data window: 1 where the frame stands alone.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -71,7 +71,9 @@ def average_renders(
     window = alignment.hr_data_window
     lrhs, hrls = pair.luminances
     light = Light(alignment, lrhs, hrls, lrhs)
-    low = {name: values.copy() for name, values in read(pair.lr, alignment.lr_data_window, features).items()}
+    low: Features = {}
+    if not pair.is_one_render:
+        low = {name: values.copy() for name, values in read(pair.lr, alignment.lr_data_window, features).items()}
     row = read(pair.hr, Window(window.x0, window.y0, window.x1, window.y0 + 1), features)
     high: Features = {name: blank((window.height, window.width, values.shape[-1])) for name, values in row.items()}
 
@@ -79,7 +81,8 @@ def average_renders(
         return RenderBand(pair, light, low, high, core, area)
 
     frames = _average(alignment, light, before, after, band, _weight(sum(image.shape[-1] for image in high.values())))
-    return _replaced(pair.lr, low), _replaced(pair.hr, high), frames
+    hr = _replaced(pair.hr, high)
+    return hr if pair.is_one_render else _replaced(pair.lr, low), hr, frames
 
 
 def average_results(

@@ -29,9 +29,10 @@ from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import RepairCounts, read_lrhs
 from oiio_msspl.image.arrays import Array, Mask, blank, repair, unload
-from oiio_msspl.image.filters import grown, interpolate, means_around
+from oiio_msspl.image.filters import even_and_odd, grown, interpolate, means_around
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices, sample_cubic
+from oiio_msspl.model.contract import ONE_SIZE
 
 #: An LRHS pixel of a neighbour counts if this share of its HRLS pixels shows the same surface.
 COVERED = 0.9
@@ -52,10 +53,15 @@ Features = dict[str, Array]
 
 @dataclass(frozen=True)
 class RenderPair:
-    """Both renders of a frame."""
+    """Both renders of a frame; one render is both."""
 
     lr: ReadableRender
     hr: ReadableRender
+
+    @property
+    def is_one_render(self) -> bool:
+        """Whether the frame has one render."""
+        return self.lr is self.hr
 
     @cached_property
     def alignment(self) -> Alignment:
@@ -66,9 +72,12 @@ class RenderPair:
     def luminances(self) -> tuple[Array, Array]:
         """Luminance of the LRHS, and of the HRLS averaged over its pixels, (h, w) each over the alignment's grid.
 
-        Both show the same places: where an odd size was rounded, the LRHS is interpolated.
+        Both show the same places: where an odd size was rounded, the LRHS is interpolated. Of one render, both are
+        that of its even and of its odd pixels.
         """
         alignment = self.alignment
+        if self.is_one_render:
+            return even_and_odd(np.concatenate(for_bands(alignment, lambda core, _: self.read_hr_luminance(core))))
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
         high = for_bands(alignment, lambda core, _: to_grid(alignment, self.read_hr_luminance(core), core))
         return bounded_luminance(lrhs), np.concatenate(high)
@@ -138,7 +147,7 @@ class RenderBand:
 
     Args:
         pair, light: the frame and its light.
-        low: the LRHS's features over its data window; the rows of ``core`` are changed.
+        low: the LRHS's features over its data window; the rows of ``core`` are changed. None of one render.
         high: gets the HRLS's features over the rows of ``core`` of its data window.
         core, area: see :func:`oiio_msspl.fusion.neighbours.bands.for_bands`.
     """
@@ -160,7 +169,7 @@ class RenderBand:
         self._low_luminance = pair.luminances[0][self._grid.slices(alignment.grid)]
         self._low_place = grid_window(alignment, core).intersect(alignment.lr_data_window)
         inside = self._low_place.slices(alignment.lr_data_window)
-        self._low = WeightedSum({name: image[inside] for name, image in low.items()})
+        self._low = WeightedSum({name: image[inside] for name, image in low.items()}) if low else None
 
     def add(self, hop: Hop[RenderPair], path: Path, judge: Judge) -> None:
         """Add the renders of a neighbour that a path leads to."""
@@ -168,10 +177,13 @@ class RenderBand:
         high = _Nearest(neighbour, path, self._names)
         valid = high.finite() & path.valid
         share = to_grid(alignment, valid.astype(np.float32), area)
-        low, usable = self._fetch_low(neighbour, path, valid, share)
-        usable &= _make_finite(low)
         hrls = to_grid(alignment, np.where(valid, high.luminance(), self._luminance), area)
-        lrhs = self._in_grid(_luminance(low[RGB]), usable, neighbour.alignment.stretch)
+        if self._low is None:
+            lrhs, hrls = even_and_odd(hrls)
+        else:
+            low, usable = self._fetch_low(neighbour, path, valid, share)
+            usable &= _make_finite(low)
+            lrhs = self._in_grid(_luminance(low[RGB]), usable, neighbour.alignment.stretch)
         counted = judge(lrhs, hrls)
         if path.moved_objects is not None:
             counted = counted * self._far_from(path.moved_objects)
@@ -180,13 +192,15 @@ class RenderBand:
         weight = from_grid(alignment, counted, area) * valid
         top = self._rows.start
         self._high.add(lambda name, rows: high.pixels(name, top + rows.start, top + rows.stop), weight[self._rows])
-        place = self._low_place.slices(self._grid)
-        self._low.add(lambda name, rows: low[name][place][rows], (counted * usable)[place])
+        if self._low is not None:
+            place = self._low_place.slices(self._grid)
+            self._low.add(lambda name, rows: low[name][place][rows], (counted * usable)[place])
         neighbour.unload()
 
     def finish(self) -> Array:
         """Turn the sums into means, and return the number of frames."""
-        self._low.divide()
+        if self._low is not None:
+            self._low.divide()
         frames = self._high.divide()
         for image in self._high_images.values():
             unload(image)
@@ -225,7 +239,8 @@ class RenderBand:
         pixels = _with_finite_passes(read(neighbour.lr, place, self._low_names))
         x, y = x - place.x0, y - place.y0
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
-        smooth = [name for name in pixels if path.x is not None and (name in light or is_light_of_pass(name))]
+        moves = path.x is not None and self._alignment.scale > ONE_SIZE  # a render of full size has noise to remove
+        smooth = [name for name in pixels if moves and (name in light or is_light_of_pass(name))]
         features = {}
         if smooth:
             images = [pixels.pop(name) for name in smooth]

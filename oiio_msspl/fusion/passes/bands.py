@@ -57,6 +57,8 @@ class PassInputs:
     averaged: tuple[Render, Render] | None = None
     """LRHS and HRLS with the features of :func:`oiio_msspl.fusion.passes.layers.pass_features`, averaged with those of
     other frames; None to read the files."""
+    decoded: tuple[ReadableRender, ReadableRender] | None = None
+    """LRHS and HRLS as the beauty was fused from them. If their light is in memory, it is not decoded again."""
 
 
 @dataclass(frozen=True, kw_only=True)

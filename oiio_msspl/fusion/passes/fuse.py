@@ -2,7 +2,7 @@
 """Fuses the layers of additive sets, so that they still sum to the fused beauty.
 
 A layer is estimated by a network (:mod:`oiio_msspl.fusion.passes.network`), or by a fit to the fused beauty
-(:mod:`oiio_msspl.fusion.passes.fit`). Then the sum is made exact (:mod:`oiio_msspl.fusion.passes.exact_sum`).
+(:mod:`oiio_msspl.fusion.passes.lines`). Then the sum is made exact (:mod:`oiio_msspl.fusion.passes.exact_sum`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.passes.bands import Band, PassInputs, PassSources, band_windows
+from oiio_msspl.fusion.passes.bands import Band, PassInputs, PassSources, band_windows, estimated_of, in_both
 from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, doubts_of, make_exact
-from oiio_msspl.fusion.passes.fit import fit_to_beauty
 from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, lrhs_names
+from oiio_msspl.fusion.passes.lines import STEPS
 from oiio_msspl.fusion.passes.network import LayerFuser, LayersByNetwork
 from oiio_msspl.fusion.passes.plan import PassJob, PassPlan, plan_passes
 from oiio_msspl.fusion.tiles.alignment import Alignment
@@ -30,6 +30,8 @@ from oiio_msspl.image.parallel import half_of_the_threads, in_parallel, one_ahea
 
 #: What derived layers leave of the beauty counts as rounding below this share of it.
 ROUNDING = np.float32(5e-7)
+#: A render whose logarithm of light differs by this much from that of the fused beauty has 1/e of the weight.
+LIGHT_SPREAD = 1.0
 
 
 @dataclass
@@ -127,9 +129,13 @@ def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, La
     """Return the light of all layers of LRHS and HRLS."""
     # A large frame is read in strips if no network needs whole layers, and the strips that are compared twice.
     decode = inputs.averaged is None and (by_network or not is_large(inputs.hr))
+    low, high = inputs.decoded or (None, None)
+    if inputs.lr is inputs.hr:
+        light = light_of(inputs.hr, layer_names(inputs.sets), decode=decode, decoded=high)
+        return light, light
     return in_parallel(
-        partial(light_of, inputs.lr, lrhs_names(inputs.lr, inputs.sets), decode=decode),
-        partial(light_of, inputs.hr, layer_names(inputs.sets), decode=decode),
+        partial(light_of, inputs.lr, lrhs_names(inputs.lr, inputs.sets), decode=decode, decoded=low),
+        partial(light_of, inputs.hr, layer_names(inputs.sets), decode=decode, decoded=high),
     )
 
 
@@ -184,10 +190,41 @@ def _fuse_set(
         layers = np.zeros((len(job.estimated) + job.remainder, *rest.shape), np.float32)
         fused = network.estimate(band, job, layers)
         if job in band.to_fit:
-            fit_to_beauty(band, job, renders, layers, [i for i in range(len(layers)) if i not in fused])
+            _fit_to_beauty(band, job, renders, layers, [i for i in range(len(layers)) if i not in fused])
         make_exact(layers, rest, job, band, shares, doubts)
         lights |= dict(zip(job.estimated, layers, strict=False))
     return lights | {layer: _sum(lights[part] for part in parts) for layer, parts in job.coarser.items()}
+
+
+def _fit_to_beauty(band: Band, job: PassJob, renders: Sequence[Array], out: Array, missing: Sequence[int]) -> None:
+    """Fit the noisy means of a set's layers, in both renders, to the fused beauty.
+
+    Args:
+        renders: of :meth:`Band.renders_of`. The first one may be written over.
+        out: gets the layers, (layers, 3, h, w) over the core.
+        missing: which ones to fit. Black ones stay as they are.
+    """
+    noisy, *lrhs = renders
+    for layers in lrhs:
+        weight = _likeness(band, layers)
+        for i in np.flatnonzero(in_both(job, len(noisy))):
+            noisy[i] += weight * layers[i]
+            noisy[i] /= 1 + weight
+    noisy = estimated_of(job, noisy)
+    if lit := [i for i in missing if noisy[i].any()]:
+        fit = band.fit_at(STEPS[band.scale])
+        fit.fit_layers([noisy[i] for i in lit], [out[i] for i in lit], few_samples=True)
+
+
+def _likeness(band: Band, layers: Array) -> Array:
+    """Return the weight (h, w) of the LRHS's layers (layers, 3, h, w): 1 where the fused beauty has as much light.
+
+    The pixel filter of the LRHS is wider. Small lights and highlights lose light to the pixels around them, and so do
+    their layers.
+    """
+    lights = (layers.sum(axis=(0, 1), dtype=np.float64), band.low_beauty.sum(axis=0, dtype=np.float64))
+    rendered, fused = (np.log(light + 3 * band.sources.dark) for light in lights)
+    return np.exp(-np.square((rendered - fused) / LIGHT_SPREAD)).astype(np.float32)
 
 
 def _sum(lights: Iterable[Array]) -> Array:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ class LayerLight:
     """The light of the layers of a render, as features of :attr:`pixels`."""
 
     file: MappedRender
-    """Has these features, the beauty, albedo, normal and :attr:`colours`."""
+    """Has these features beside its own, and :attr:`colours`."""
     names: Mapping[AdditiveLayer, str]
     """Names of features, by layer."""
     pixels: ReadableRender
@@ -36,24 +36,42 @@ class LayerLight:
     @property
     def colours(self) -> dict[Factor, str]:
         """Names, as features, of the colours by which layers are multiplied."""
-        factors = dict.fromkeys(layer.factor for layer in self.names if layer.factor is not None)
-        return {factor: f"colour {i}" for i, factor in enumerate(factors)}
+        return _colours(self.names)
 
 
-def light_of(render: MappedRender, names: Mapping[AdditiveLayer, str], *, decode: bool = False) -> LayerLight:
+def light_of(
+    render: MappedRender,
+    names: Mapping[AdditiveLayer, str],
+    *,
+    decode: bool = False,
+    decoded: ReadableRender | None = None,
+) -> LayerLight:
     """Return the light of layers of a render.
 
     Args:
         decode: whether all pixels are decoded now, once: into temporary files if there are many.
+        decoded: the render, perhaps in memory. It is used if it has the features of :func:`with_light`.
 
     Raises:
         InputError: pixels can't be decoded.
     """
-    formulas = {name: render.features[name] for name in (RGB, ALBEDO, NORMAL) if name in render.features}
-    formulas |= {name: layer.formula for layer, name in names.items()}
-    formulas |= {name: FeatureFormula((factor,)) for factor, name in LayerLight(render, names, render).colours.items()}
-    file = replace(render, features=formulas)
-    return LayerLight(file, names, file.load(formulas, on_disk=is_large(file)) if decode else file)
+    file = with_light(render, names)
+    needed = [RGB, ALBEDO, NORMAL, *names.values(), *_colours(names).values()]
+    if isinstance(decoded, Render) and decoded.layers.keys() >= file.features.keys() & {*needed}:
+        return LayerLight(file, names, decoded)
+    return LayerLight(file, names, file.load(needed, on_disk=is_large(file)) if decode else file)
+
+
+def with_light(render: MappedRender, names: Mapping[AdditiveLayer, str]) -> MappedRender:
+    """Return a render with the light of layers, and the colours that it is multiplied by, as further features."""
+    light = {name: layer.formula for layer, name in names.items()}
+    colours = {name: FeatureFormula((factor,)) for factor, name in _colours(names).items()}
+    return replace(render, features=render.features | light | colours)
+
+
+def _colours(names: Iterable[AdditiveLayer]) -> dict[Factor, str]:
+    factors = dict.fromkeys(layer.factor for layer in names if layer.factor is not None)
+    return {factor: f"colour {i}" for i, factor in enumerate(factors)}
 
 
 def is_large(render: MappedRender) -> bool:
@@ -101,6 +119,9 @@ def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet
     """
     names = layer_names(sets)
     high = {names[layer]: layer.formula for additive_set in sets for layer in additive_set.layers}
+    if lr is hr:
+        render = replace(hr, features=hr.features | high)
+        return render, render
     low = {name: layer.formula for layer, name in lrhs_names(lr, sets).items()}
     return replace(lr, features=lr.features | low), replace(hr, features=hr.features | high)
 

@@ -17,12 +17,13 @@ from oiio_msspl.fusion.tiles.guards import LAYER_REACH
 from oiio_msspl.image.arrays import Array, planes_of
 from oiio_msspl.image.filters import blurred, box_downsample, grown, max_3x3
 from oiio_msspl.image.parallel import for_row_blocks, two_at_a_time
+from oiio_msspl.model.contract import ONE_SIZE
 
 #: Rows of a band whose weights stay in a core's cache while several planes are averaged.
 CACHED_ROWS = 16
-#: A fit averages 5 x 5 LRHS pixels so far apart, and then the averages likewise. At x2 a pixel has fewer samples, so
-#: more of them are needed.
-STEPS = {2: (1, 3), 4: (1, 2), 8: (1, 2)}
+#: A fit averages 5 x 5 LRHS pixels so far apart, and then the averages likewise. The smaller the scale, the fewer
+#: samples a pixel has, so more of them are needed.
+STEPS = {ONE_SIZE: (1, 2, 4), 2: (1, 3), 4: (1, 2), 8: (1, 2)}
 #: Pixels of the HRLS choose among fits around them with the spread divided by this.
 SHARPER = 1.4
 #: Keeps a fit from following noise: variance that is added to the guide, relative to its mean square.

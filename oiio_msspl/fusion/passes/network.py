@@ -50,6 +50,7 @@ class LayersByNetwork:
     def __init__(self, sources: PassSources, jobs: Sequence[PassJob], fuse: LayerFuser | None) -> None:
         self._fuse, self._alignment = fuse if any(job.lrhs for job in jobs) else None, sources.alignment
         self._renders = cast(tuple[Render, Render], (sources.low, sources.high))
+        self._is_one_render = sources.lr is sources.hr
         self.at_full_size: dict[AdditiveLayer, Array] = {}
         """Layers that were fused at full resolution, (height, width, 3) over the HRLS's data window."""
         self._at_half_size: dict[AdditiveLayer, Array] = {}
@@ -94,10 +95,8 @@ class LayersByNetwork:
             high_guides = {name: _half_of(image, self._alignment) for name, image in high_guides.items()}
         for name in names:
             light = _half_of(high.layers[name], self._alignment) if half else high.layers[name]
-            yield (
-                replace(low, layers={RGB: low.layers[name], **guides}),
-                replace(high, layers={RGB: light, **high_guides}),
-            )
+            hrls = replace(high, layers={RGB: light, **high_guides})
+            yield hrls if self._is_one_render else replace(low, layers={RGB: low.layers[name], **guides}), hrls
 
     def estimate(self, band: Band, job: PassJob, out: Array) -> set[int]:
         """Put the fused layers of a set into ``out``, (layers, 3, h, w) over the core of a band. Return which ones.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Window
-from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.contract import ONE_SIZE, SCALES
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Alignment:
 
 
 def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
-    """Find how the pixels of a pair lie over each other.
+    """Find how the pixels of a pair lie over each other; of one render, which is given as both, or of two of one size.
 
     An HRLS of odd size (1921 x 1081) may come with an LRHS that is rounded up or down (961 x 541 or 960 x 540).
     Renderers fit the whole frame into either size, so an LRHS pixel is not exactly s HRLS pixels wide: ``stretch`` is
@@ -68,7 +68,7 @@ def _shape(render: ReadableRender) -> float:
 
 def _scale(low: Window, high: Window) -> int | None:
     sides = (low.width, high.width), (low.height, high.height)
-    fitting = (s for s in SCALES if all(small in (large // s, -(-large // s)) for small, large in sides))
+    fitting = (s for s in (ONE_SIZE, *SCALES) if all(small in (large // s, -(-large // s)) for small, large in sides))
     return next(fitting, None)
 
 
@@ -85,4 +85,7 @@ def _wrong_ratio(lr: ReadableRender, hr: ReadableRender) -> InputError:
         what = f"framing differs: the ratio is {x:.3g} in width and {y:.3g} in height"
     else:
         what = f"a ratio of {x:.3g} is not supported"
-    return InputError(f"{what} ({lr.name} is {low.size}, {hr.name} is {high.size}); render the LRHS at one of {wanted}")
+    return InputError(
+        f"{what} ({lr.name} is {low.size}, {hr.name} is {high.size}); render the LRHS at one of {wanted}, "
+        "or at the size of the HRLS with a noise seed of its own"
+    )

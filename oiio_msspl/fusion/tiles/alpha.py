@@ -7,34 +7,45 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.fusion.tiles.features import TileFeatures
-from oiio_msspl.fusion.tiles.guards import check_finite, repeated
+from oiio_msspl.fusion.tiles.guards import SMEAR, check_finite, repeated
+from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import all_within
 from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.session import Session
 
+#: Nearer to what is translucent, the network decides, up to this difference.
+INVISIBLE = 1 / 256
 
-def fuse_alpha(tile: TileFeatures, session: Session, shares: Shares) -> Array:
+
+def fuse_alpha(tile: TileFeatures, session: Session, shares: Shares, *, trust: bool) -> Array:
     """Fuse the alpha of a tile, (s*h, s*w, 1) in [0, 1].
 
-    A pixel is exactly 1 or 0 if its LRHS pixel and the 3 x 3 HRLS pixels around it are. The network would blur edges
-    over several pixels. A tile of such pixels only does not reach the network. If the LRHS has no alpha, that of the
-    HRLS is kept.
+    A pixel is exactly 1 or 0 if its LRHS pixel and the HRLS pixels around it are. A tile of such pixels only does not
+    reach the network. If the LRHS has no alpha, that of the HRLS is kept.
 
     Args:
         shares: see :meth:`oiio_msspl.model.session.Session.run`.
+        trust: put back what both renders show, such as crisp edges (:func:`.trust_renders`).
     """
     hrls_alpha = np.clip(tile.hrls["alpha"], 0.0, 1.0)
     if "alpha" not in tile.lrhs:
         return hrls_alpha
     lrhs_alpha = np.clip(tile.lrhs["alpha"], 0.0, 1.0)
-    solid, empty = (repeated(lrhs_alpha == value, tile.scale) & all_within(hrls_alpha == value, 1) for value in (1, 0))
-    if (solid | empty).all():
-        return solid.astype(np.float32)
+    exact = [repeated(lrhs_alpha == value, tile.scale) & (hrls_alpha == value) for value in (0, 1)]
+    if (exact[0] | exact[1]).all():
+        return exact[1].astype(np.float32)
     grey = session.run(*alpha_as_colour(tile), 1.0, shares)["fused"]
     check_finite(session, grey)
-    fused = np.clip(grey.mean(axis=-1, keepdims=True), 0.0, 1.0)
-    return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
+    fused = grey.mean(axis=-1, keepdims=True)
+    if trust and RGB in shares:
+        renders = Renders(lrhs_alpha, hrls_alpha, shares[RGB], 1.0)
+        fused, _ = trust_renders(fused, renders, session.contract.overlap)
+    fused = np.clip(fused, 0.0, 1.0)
+    for value, mask in enumerate(exact):
+        near = all_within(mask, 1) & (np.abs(fused - np.float32(value)) < INVISIBLE)
+        fused[all_within(mask, SMEAR) | near] = value
+    return fused
 
 
 def alpha_as_colour(tile: TileFeatures) -> tuple[Images, Images]:

@@ -165,12 +165,16 @@ FAR = 15
 LAYER_REACH = 16
 
 
+#: HRLS pixels around an empty pixel that show no surface either. Thin smears have empty samples between them.
+SMEAR = 8
+
+
 class EmptyRegions:
     """The regions where neither render has light, and that become black, so that a transparent film stays empty.
 
-    A pixel is empty if it and the 3 x 3 LRHS pixels around are black. A dark surface may have no lit sample near, and a
-    network spreads the light of a single sample far. So a pixel that shows a surface is empty only if both renders are
-    black over ``reach`` pixels around. Otherwise the result would have black holes.
+    A pixel is empty if it and the 3 x 3 LRHS pixels around are black, and no surface is near. A dark surface may have
+    no lit sample near, and a network spreads the light of a single sample far. So a pixel near a surface is empty only
+    if both renders are black over ``reach`` pixels around. Otherwise the result would have black holes.
 
     In a pass, this also holds without a surface where light is rare. Few samples find a lamp that is out of focus, and
     the others find the empty background behind it. If the pass of the lamp were black there, its light in the beauty
@@ -202,13 +206,21 @@ class EmptyRegions:
             return None
         black = _is_zero(tile.hrls[RGB])
         empty = repeated(all_within(self._black[window], 1), tile.scale) & black
-        no_surface = _shows_no_surface(tile.hrls) & ~repeated(self._has_rare_light[window], tile.scale)
+        no_surface = all_within(_shows_no_surface(tile.hrls), SMEAR) & ~repeated(
+            self._has_rare_light[window], tile.scale
+        )
         far = self._black_far_around[window]
         if far.any():
             blocks = black.reshape(len(far), tile.scale, -1, tile.scale, 1)
             far = far & all_within(np.logical_and.reduce(blocks, axis=(1, 3)), self._reach)
         empty &= no_surface | repeated(far, tile.scale)
         return empty
+
+
+def black_in_both(lrhs_rgb: Array, hrls_rgb: Array) -> Mask:
+    """Return the HRLS pixels (s*h, s*w, 1) that are black, as are the 3 x 3 LRHS pixels around."""
+    scale = len(hrls_rgb) // len(lrhs_rgb)
+    return repeated(all_within(_is_zero(lrhs_rgb), 1), scale) & _is_zero(hrls_rgb)
 
 
 def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:

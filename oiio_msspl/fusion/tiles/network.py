@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, RGB
-from oiio_msspl.exr.render import Render
+from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.alpha import fuse_alpha
-from oiio_msspl.fusion.tiles.guards import LAYER_REACH, check_finite
+from oiio_msspl.fusion.tiles.guards import LAYER_REACH, black_in_both, check_finite
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile
+from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
+from oiio_msspl.image.filters import enlarged
 from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.model.render_mean import Images, Shares
@@ -38,11 +40,22 @@ class FusedPixels:
     alignment: Alignment
     exposure: float
     """Factor that the scene was multiplied by for the network."""
+    trust: Array | None = field(default=None, kw_only=True)
+    """(h, w) over the alignment's grid, in [0, 1]: how much of the difference to the HRLS was put back, see
+    :func:`oiio_msspl.fusion.tiles.trust.trust_renders`. None if the network's picture is kept."""
     clipped: int = field(default=0, kw_only=True)
     """Number of values of ``rgb`` that were too bright for half; 0 for float32."""
     clean_aovs: dict[str, NDArray[np.float16]] = field(default_factory=dict, kw_only=True)
     """Albedo and normal of the HRLS without noise, (height, width, 3): those that it has, that the model denoises and
     that were asked for. Albedos above 1 are as rendered."""
+
+    def trust_pixels(self) -> Array:
+        """Return ``trust`` at the resolution of the HRLS, (height, width, 1); 0 without it."""
+        if self.trust is None:
+            return np.zeros_like(self.rgb[..., :1], np.float32)
+        scale, grid, data = self.alignment.scale, self.alignment.grid, self.alignment.hr_data_window
+        whole = enlarged(self.trust[..., None], scale)
+        return whole[data.slices(Window(grid.x0 * scale, grid.y0 * scale, grid.x1 * scale, grid.y1 * scale))]
 
 
 @dataclass(frozen=True)
@@ -86,13 +99,20 @@ def _fuse_tile(task: TileTask, session: Session) -> None:
     features, empty = tile.features, tile.empty
     target = features.hrls_target.slices(result.alignment.hr_data_window)
     core = features.hrls_target.slices(features.hrls_area)
+    if "alpha" in features.hrls:
+        if result.alpha is None:
+            result.alpha = np.empty((*result.rgb.shape[:2], 1), dtype=np.float32)
+        alpha = fuse_alpha(features, session, alpha_shares, trust=result.trust is not None)
+        result.alpha[target] = alpha[core]
+        if empty is not None and tile.lrhs is not None and tile.hrls is not None:
+            empty = empty | black_in_both(tile.lrhs[RGB], tile.hrls[RGB]) & (alpha == 0)
     if tile.hrls is not None:
         images = _run_network(tile, session, result.exposure, shares, error=result.error is not None)
         for name in tile.aovs:
             if name not in result.clean_aovs:
                 result.clean_aovs[name] = blank(result.rgb.shape, np.float16)
             result.clean_aovs[name][target] = images[name][core].clip(-HALF_MAX, HALF_MAX)
-        rgb = images["fused"][core]
+        rgb = _trusted(tile, images["fused"], result, shares, session.contract.overlap)[core]
         if tile.lights is not None:
             lights = tile.lights[core]
             rgb = np.where(np.any(lights > 0, axis=-1, keepdims=True), lights, rgb)
@@ -107,10 +127,19 @@ def _fuse_tile(task: TileTask, session: Session) -> None:
             if empty is not None:
                 error *= ~empty
             result.error[target] = error[core]
-    if "alpha" in features.hrls:
-        if result.alpha is None:
-            result.alpha = np.empty((*result.rgb.shape[:2], 1), dtype=np.float32)
-        result.alpha[target] = fuse_alpha(features, session, alpha_shares)[core]
+
+
+def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shares, reach: int) -> Array:
+    """Return the picture of a tile with the detail and the light that both renders show."""
+    if result.trust is None or tile.noise_free or RGB not in shares:
+        return fused
+    assert tile.lrhs is not None and tile.hrls is not None
+    renders = Renders(tile.lrhs[RGB], tile.hrls[RGB], shares[RGB], result.exposure)
+    picture, trust = trust_renders(fused, renders, reach)
+    (rows, columns), area = tile.features.core, tile.features.lrhs_area
+    core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
+    result.trust[core.slices(result.alignment.grid)] = trust[rows, columns]
+    return picture
 
 
 def _run_network(tile: PreparedTile, session: Session, exposure: float, shares: Shares, *, error: bool) -> Images:

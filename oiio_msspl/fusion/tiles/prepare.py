@@ -14,7 +14,7 @@ from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, read_lr
 from oiio_msspl.fusion.tiles.guards import FAR, EmptyRegions, bright_lights, dim_fireflies, is_noise_free, lit_window
 from oiio_msspl.fusion.tiles.tiling import Tile, network_grid, plan_tiles, sample_bands
 from oiio_msspl.image.arrays import Array, Mask
-from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.contract import ONE_SIZE, Contract
 from oiio_msspl.model.encoding import find_exposure
 from oiio_msspl.model.render_mean import Images, Shares, find_shares
 
@@ -42,10 +42,11 @@ class FramePair:
     """Both renders of a frame: the LRHS in memory, and the HRLS that is read tile by tile.
 
     Args:
-        lr, hr: the renders.
+        lr, hr: the renders; one render is given as both.
         alignment: how their pixels lie over each other.
         contract: of the model.
         aovs: AOVs of the HRLS whose denoised pixels are kept.
+        share: of the LRHS in the mean of both renders; None to find it.
         of_pass: exposure of the beauty, and reach of :class:`oiio_msspl.fusion.tiles.guards.EmptyRegions`, if the
             renders show a pass in place of the beauty.
         on_read: called with the features of each tile.
@@ -59,14 +60,20 @@ class FramePair:
         contract: Contract,
         aovs: Sequence[str] = (),
         *,
+        share: float | None = None,
         of_pass: tuple[float, int] | None = None,
         on_read: Callable[[TileFeatures], object] = lambda _: None,
     ) -> None:
         self._lr, self._hr, self._alignment, self._contract = lr, hr, alignment, contract
-        self._aovs, self._on_read = aovs, on_read
+        self._aovs, self._share, self._on_read = aovs, share, on_read
+        self._is_one_render = lr is hr
         self.grid = network_grid(alignment, contract)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
-        self._lrhs = read_lrhs(lr, alignment, self.grid, [*contract.lrhs, "alpha"], self._lrhs_counts)
+        #: Features of the LRHS that are read tile by tile, because those of full size would take too much memory. One
+        #: render has them in the HRLS, except alpha.
+        self._lrhs_by_tile = [*([] if lr is hr else contract.lrhs[1:]), "alpha"] if alignment.scale == ONE_SIZE else []
+        whole = [name for name in (*contract.lrhs, "alpha") if name not in self._lrhs_by_tile]
+        self._lrhs = read_lrhs(lr, alignment, self.grid, whole, self._lrhs_counts)
         self.lrhs_has_alpha = "alpha" in self._lrhs
         self.lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
         """Colour of the LRHS (h, w, 3) over the grid of the alignment."""
@@ -96,15 +103,17 @@ class FramePair:
             lrhs_rgb, prepared.hrls = dim_fireflies(features)
             prepared.lrhs = features.lrhs | {RGB: lrhs_rgb}
             prepared.lights = bright_lights(lrhs_rgb, prepared.hrls[RGB], self.exposure)
-            prepared.noise_free = is_noise_free(features, lrhs_rgb, prepared.hrls[RGB], self.exposure)
+            prepared.noise_free = not self._is_one_render and is_noise_free(
+                features, lrhs_rgb, prepared.hrls[RGB], self.exposure
+            )
         return prepared
 
     def sample_shares(self) -> tuple[Shares, Shares]:
         """Return the LRHS's shares in the mean of both renders, of colour and of alpha, which many models denoise.
 
-        They come from bands of the frame, so that neighbouring tiles agree.
+        They come from bands of the frame, so that neighbouring tiles agree. One render has none: they are 0.
         """
-        if not self._contract.denoiser:
+        if not self._contract.denoiser or self._is_one_render:
             return {}, {}
         colours, alphas = [], []
         for band in sample_bands(self._alignment.grid, self._contract.scale):
@@ -113,7 +122,8 @@ class FramePair:
             colours.append((features.lrhs | {RGB: lrhs_rgb}, hrls))
             if "alpha" in features.lrhs and "alpha" in features.hrls:
                 alphas.append(alpha_as_colour(features))
-        return find_shares(colours, self.exposure), find_shares(alphas, 1.0) if alphas else {}
+        share = self._share
+        return find_shares(colours, self.exposure, share), find_shares(alphas, 1.0, share) if alphas else {}
 
     def exact_lrhs_rgb(self) -> Array:
         """Return the colour of the LRHS at the places of its HRLS pixels, (h, w, 3) over the grid of the alignment.
@@ -125,7 +135,12 @@ class FramePair:
         return read_lrhs(self._lr, self._alignment, self._alignment.grid, [RGB], exact=True)[RGB]
 
     def _read(self, tile: Tile, features: Sequence[str], counts: RepairCounts | None = None) -> TileFeatures:
-        return read_tile(tile, self._lrhs, self.grid, self._hr, self._alignment, features, counts)
+        lrhs, grid = self._lrhs, self.grid
+        if self._lrhs_by_tile:
+            lrhs, grid = {name: values[tile.area.slices(grid)] for name, values in lrhs.items()}, tile.area
+            lrhs |= read_lrhs(self._lr, self._alignment, tile.area, self._lrhs_by_tile)
+            self.lrhs_has_alpha = "alpha" in lrhs
+        return read_tile(tile, lrhs, grid, self._hr, self._alignment, features, counts)
 
     def _lit_part(self, reach: int) -> Window | None:
         """Return the part of the grid within ``reach`` of light; None for all of it, if a render is black."""

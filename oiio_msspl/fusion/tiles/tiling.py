@@ -17,7 +17,7 @@ from typing import NamedTuple
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.contract import ONE_SIZE, Contract
 
 #: Bytes that a process may use by default.
 MAX_MEMORY = 3 << 30
@@ -127,8 +127,10 @@ def result_bytes(alignment: Alignment, *, error: bool) -> int:
 def memory_to_fuse(alignment: Alignment, contract: Contract, *, error: bool) -> int:
     """Return the smallest ``max_memory`` with which a frame can be fused, from its headers."""
     grid = network_grid(alignment, contract)
-    # The LRHS lies in memory, with all features that the model may read: alpha has 1 channel, the others have 3.
-    lrhs = grid.width * grid.height * (3 * len(contract.lrhs) + 1) * 4
+    # The LRHS lies in memory, with all features that the model may read: alpha has 1 channel, the others have 3. Of one
+    # of full size, only the beauty does.
+    channels = 3 if contract.scale == ONE_SIZE else 3 * len(contract.lrhs) + 1
+    lrhs = grid.width * grid.height * channels * 4
     return FIXED_MEMORY + result_bytes(alignment, error=error) + lrhs + tile_bytes(alignment, contract)
 
 

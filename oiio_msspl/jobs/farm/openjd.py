@@ -21,7 +21,7 @@ from oiio_msspl.jobs.checks import check_no_file, check_no_input, model_of_shot
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
 from oiio_msspl.model.catalogue import find_model, shipped_models
-from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.contract import ONE_SIZE, SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS
 
 #: Seconds between SIGTERM and SIGKILL, in which msspl-fuse finishes the frame that it is writing.
@@ -32,6 +32,10 @@ _LONGEST = 1024
 
 #: Files of a bundle. Deadline Cloud prescribes the first two names; ``openjd run`` reads the values from the third.
 TEMPLATE, VALUES, OPENJD_VALUES = "template.json", "parameter_values.json", "openjd_values.json"
+
+
+#: Job parameters of the renders, and what they are. One render is the last one.
+_RENDERS = (("LR", "Low-resolution, high-spp renders"), ("HR", "High-resolution, low-spp renders"))
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,8 @@ class Job:
         """The patterns that lack files of the shot, and the frames. Their tasks fail unless the files appear."""
         low = sorted(frame.number for frame in self.shot.frames if frame.lr is None)
         high = sorted(frame.number for frame in self.shot.frames if frame.hr is None)
-        sides = ((self.shot.lr, low), (self.shot.hr, high))
-        return [(str(sequence.pattern), numbers) for sequence, numbers in sides if numbers]
+        sides = {str(self.shot.lr.pattern): low, str(self.shot.hr.pattern): high}
+        return [(pattern, numbers) for pattern, numbers in sides.items() if numbers]
 
     @property
     def existing(self) -> int:
@@ -59,7 +63,7 @@ class Job:
 
 
 def make_job(
-    lr: Path,
+    lr: Path | None,
     hr: Path,
     output: Path,
     *,
@@ -94,10 +98,11 @@ def make_job(
     Raises:
         InputError: a path, a file or an option can't be used, no frame has both renders, or a job can't contain it.
     """
-    for path in (lr, hr, output, *([map_file] if map_file else [])):
+    renders = [path for path in (lr, hr) if path is not None]
+    for path in (*renders, output, *([map_file] if map_file else [])):
         check_encodable(path)
-    if not (is_sequence(lr) or is_sequence(hr)):
-        raise InputError(f"{lr}: a job is for a shot: give folders, or patterns such as lr.####.exr")
+    if not any(is_sequence(path) for path in renders):
+        raise InputError(f"{renders[0]}: a job is for a shot: give folders, or patterns such as lr.####.exr")
     if device not in PROVIDERS:
         raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
     if view is not None:
@@ -107,7 +112,7 @@ def make_job(
     shot = find_shot(lr, hr, output, frames)
     # The job names its model: a worker with another version, which would choose another family, then refuses the frame.
     name = model_of_shot(shot, inputs, model)
-    if shipped_models().keys() & {name, *(f"{name}-x{scale}" for scale in SCALES)}:
+    if shipped_models().keys() & {name, *(f"{name}-x{scale}" for scale in (ONE_SIZE, *SCALES))}:
         options += ["--model", name]
     else:
         files["--model"] = find_model(SCALES[0], name)
@@ -120,14 +125,19 @@ def make_job(
     folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
     if not folder.is_dir():
         raise InputError(f"{output}: the folder {folder} does not exist; create it first")
-    return _describe(shot, (lr, hr, output), options, files, chunk, timeout)
+    return _describe(shot, renders, output, options, files, chunk, timeout)
 
 
 def _describe(
-    shot: Shot, paths: Sequence[Path], options: Sequence[str], files: dict[str, Path], chunk: int, timeout: int
+    shot: Shot,
+    renders: Sequence[Path],
+    output: Path,
+    options: Sequence[str],
+    files: dict[str, Path],
+    chunk: int,
+    timeout: int,
 ) -> Job:
     """Write the job of a shot that was checked. ``files`` are options of ``msspl-fuse`` that name a file."""
-    lr, hr, output = paths
     parameters: list[dict[str, Any]] = []
     values: dict[str, Any] = {}
 
@@ -149,8 +159,10 @@ def _describe(
         return f"{directory}/{pattern}"
 
     arguments = [
-        add_sequence("LR", lr, lr.is_dir(), "Low-resolution, high-spp renders", "IN"),
-        add_sequence("HR", hr, hr.is_dir(), "High-resolution, low-spp renders", "IN"),
+        *(
+            add_sequence(name, path, path.is_dir(), what, "IN")
+            for (name, what), path in zip(_RENDERS[-len(renders) :], renders, strict=True)
+        ),
         "--output",
         add_sequence("Out", output, shot.output.folder == output, "Fused frames", "OUT"),
     ]

@@ -12,34 +12,28 @@ says so, give that sequence Blender's format, in one line::
     --motion-format layer=Vector,channels=XY,to=previous,x=right,y=up,unit=pixels
                    +layer=Vector,channels=ZW,to=next,x=left,y=down,unit=pixels
 
-:mod:`research.benchmarks.shots.measures` defines the measures. ``--picture`` and ``--film`` draw the first sequence.
+:mod:`research.benchmarks.shots.measures` defines the measures.
 """
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from oiio_msspl import map_render, open_exr
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions
 from oiio_msspl.model.catalogue import QUALITIES as MODELS
 from oiio_msspl.model.contract import SPREAD
 from research.benchmarks import results
 from research.benchmarks.results import Row
-from research.benchmarks.scenes import beauty
 from research.benchmarks.shots.measures import flicker, psnr, relmse
-from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, OIDN_BEST, QUALITIES, Made, all_methods
-from research.benchmarks.shots.pictures import film, strip
+from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, QUALITIES, Made, all_methods
 from research.benchmarks.shots.sequence import Sequence, load, without_vectors
 
 KEYS = ("sequence", "scale", "method")
-#: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
-DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(104, 216), slice(90, 250)), 160
 
 
 def model_of(method: str, scale: int, *, spread: bool) -> Row:
@@ -74,36 +68,18 @@ def main() -> None:
     parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
     parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
     parser.add_argument("--methods", default="*", metavar="PATTERN", help="measure only these")
-    parser.add_argument("--picture", type=Path, help="draw a PNG")
-    parser.add_argument("--film", type=Path, help="draw an animated WebP")
     args = parser.parse_args()
     files = args.folder.glob("*/*/hr.0001.exr")
     names = args.sequence or sorted(f"{path.parent.parent.name}/{path.parent.name}" for path in files)
     if not names:
         parser.error(f"{args.folder}: holds no sequences; python -m research.benchmarks.render.sequences makes them")
-    for index, name in enumerate(names):
+    for name in names:
         sequence = load(args.folder / name, args.motion_format)
         options = TemporalOptions(args.temporal, args.motion_format)
         with tempfile.TemporaryDirectory() as folder:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
             made = list(all_methods(judged, options, args.methods, spread=args.spread))
-        rows = list(measure(sequence, made, spread=args.spread))
-        results.show(rows, args.table, KEYS)
-        if index == 0 and (args.picture or args.film):
-            draw(args, sequence, made)
-
-
-def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None:
-    """Draw a sequence."""
-    by_method = {method.method: method.images for method in made if method.scale in (1, DRAWN_SCALE)}
-    hrls = np.stack([beauty(map_render(open_exr(sequence.folder / f"hr.{n:04d}.exr"))) for n in sequence.numbers])
-    truth = (sequence.truth[0] + sequence.truth[1]) / np.float32(2)
-    titles = {"HRLS": hrls, ALONE: by_method[ALONE], NEIGHBOURS: by_method[NEIGHBOURS], OIDN_BEST: by_method[OIDN_BEST]}
-    shown = {title: srgb(images) for title, images in (titles | {"reference": truth}).items()}
-    if args.picture:
-        strip(args.picture, shown, FRAMES, CROP, ROW)
-    if args.film:
-        film(args.film, {title: images for title, images in shown.items() if title != "HRLS"}, CROP)
+        results.show(list(measure(sequence, made, spread=args.spread)), args.table, KEYS)
 
 
 if __name__ == "__main__":

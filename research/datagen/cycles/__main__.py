@@ -19,7 +19,6 @@ def main() -> int:
         help="pixel filter of both renders; without it, the LRHS has a box filter and every fourth HRLS a wider one",
     )
     args = parser.parse_args()
-    from .assets import Assets
     from .render import render_scene
 
     # Blender prints a line for every file that it saves or imports. Python keeps the terminal, Blender gets /dev/null.
@@ -28,9 +27,8 @@ def main() -> int:
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
 
-    assets = Assets(args.assets)
     return command_line.render_all(
-        args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp, args.threads, args.filter)
+        args, lambda seed: render_scene(args.out, seed, args.views, args.ref_spp, args.threads, args.filter)
     )
 
 

@@ -312,10 +312,10 @@ def waxen(rng: Rng, size: float) -> Material:
     return principled("waxen", rng, inputs, graph, material, 4 / size)
 
 
-def glass(rng: Rng, tinted: float = 0.3) -> Material:
+def glass(rng: Rng) -> Material:
     """For closed meshes."""
     material, graph = new("glass")
-    tint = tex.color(rng, 0.5, 1.0) if chance(rng, tinted) else np.full(3, 0.97)
+    tint = tex.color(rng, 0.5, 1.0) if chance(rng, 0.3) else np.full(3, 0.97)
     roughness = 0.0 if chance(rng, 0.65) else 10 ** rng.uniform(-1.5, -0.3)
     inputs = {"Base Color": tint, "Roughness": roughness, "IOR": rng.uniform(1.3, 1.7), "Transmission Weight": 1}
     if chance(rng, 0.1):
@@ -337,12 +337,12 @@ def pane(rng: Rng) -> Material:
     return material
 
 
-def leaf(rng: Rng, glossy: float = 0.5) -> Material:
+def leaf(rng: Rng) -> Material:
     """Thin and translucent; the colour varies with u from leaf to leaf and from object to object."""
     material, graph = new("leaf")
     base = image_node(graph, tex.foliage(rng), graph.add("ShaderNodeTexCoord").outputs["UV"])
     front = graph.add("ShaderNodeBsdfPrincipled", {"Base Color": base, "Roughness": rng.uniform(0.25, 0.6),
-                                                   "Specular IOR Level": 0.5 * chance(rng, glossy)})  # fmt: skip
+                                                   "Specular IOR Level": 0.5 * chance(rng, 0.5)})  # fmt: skip
     back = graph.add("ShaderNodeBsdfTranslucent", {"Color": base})
     graph.surface(graph.add("ShaderNodeMixShader", {0: rng.uniform(0.1, 0.5), 1: front.outputs[0], 2: back.outputs[0]}))
     return material

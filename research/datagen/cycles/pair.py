@@ -18,7 +18,6 @@ from typing import Any, TypeAlias
 import bpy
 from mathutils import Vector
 
-V5 = bpy.app.version >= (5, 0, 0)
 Material: TypeAlias = bpy.types.Material
 Colour = tuple[float, float, float, float]
 Point = tuple[float, float, float]
@@ -133,17 +132,14 @@ def painting() -> Material:
     return mat
 
 
-def glass(caustics: bool) -> Material:
-    """Plain glass, or glass whose shadow is clear so that path tracing it stays quiet."""
+def glass() -> Material:
+    """Glass whose shadow is clear, so that path tracing it stays quiet."""
     mat = bpy.data.materials.new("Glass")
     mat.use_nodes = True
     nt = mat.node_tree
     nt.nodes.clear()
     out = nt.nodes.new("ShaderNodeOutputMaterial")
     bsdf = node(nt, "ShaderNodeBsdfGlass", Color=rgb(0.95, 0.985, 0.97), Roughness=0.0, IOR=1.45)
-    if caustics:
-        nt.links.new(bsdf.outputs[0], out.inputs["Surface"])
-        return mat
     path = nt.nodes.new("ShaderNodeLightPath")
     clear = node(nt, "ShaderNodeBsdfTransparent", Color=rgb(0.86, 0.90, 0.88))
     mix = nt.nodes.new("ShaderNodeMixShader")
@@ -155,17 +151,12 @@ def glass(caustics: bool) -> Material:
 
 
 # ----------------------------------------------------------------- geometry
-_index = [0]
-
-
 def finish(ob: Any, mat: Material | None = None, smooth: bool = False) -> Any:
-    """Give an object its material, smoothness and a pass index of its own."""
+    """Give an object its material and smoothness."""
     if mat is not None:
         ob.data.materials.append(mat)
     if smooth:
         ob.data.polygons.foreach_set("use_smooth", [True] * len(ob.data.polygons))
-    _index[0] += 1
-    ob.pass_index = _index[0]
     return ob
 
 
@@ -202,9 +193,9 @@ def tube(name: str, points: list[Point], radius: float, mat: Material) -> Any:
     return finish(ob, mat)
 
 
-def cloth(name: str, mat: Material, at: Point, radius: float = 0.56, drop: float = 0.50) -> Any:
+def cloth(name: str, mat: Material, at: Point) -> Any:
     """Make a round tablecloth: a flat top, a rounded edge and folds that grow towards the hem."""
-    n, rings = 220, 44
+    n, rings, radius, drop = 220, 44, 0.56, 0.50
     total = radius + drop
     verts: list[Point] = [(0, 0, 0)]
     flat: list[tuple[float, float]] = [(0, 0)]  # where the point lay before it was draped
@@ -230,12 +221,10 @@ def cloth(name: str, mat: Material, at: Point, radius: float = 0.56, drop: float
     return ob
 
 
-def grass(
-    name: str, rng: random.Random, mat: Material, at: Point, radius: float, height: float, count: int = 260
-) -> Any:
+def grass(name: str, rng: random.Random, mat: Material, at: Point, radius: float, height: float) -> Any:
     verts: list[Any] = []
     faces: list[Any] = []
-    for _ in range(count):
+    for _ in range(260):
         a, r = rng.uniform(0, 2 * math.pi), radius * math.sqrt(rng.random())
         base = Vector((r * math.cos(a), r * math.sin(a), 0))
         lean = Vector((math.cos(a), math.sin(a), 0)) * rng.uniform(0.05, 0.75) * (0.3 + r / radius)
@@ -264,19 +253,18 @@ def cone(name: str, r1: float, r2: float, depth: float, mat: Material, at: Point
     return finish(ob, mat)
 
 
-def label(text: str, size: float, mat: Material, at: Point, rotation: Point = (90, 0, 0)) -> Any:
+def label(text: str, size: float, mat: Material, at: Point) -> Any:
     curve = bpy.data.curves.new("Text", "FONT")
     curve.body, curve.size, curve.align_x = text, size, "CENTER"
     ob = bpy.data.objects.new(f"Text {text}", curve)
-    ob.location, ob.rotation_euler = at, [math.radians(d) for d in rotation]
+    ob.location, ob.rotation_euler = at, (math.radians(90), 0, 0)
     bpy.context.scene.collection.objects.link(ob)
     return finish(ob, mat)
 
 
 # -------------------------------------------------------------------- scene
-def build_scene(seed: int, transparent: bool = False, caustics: bool = False) -> Any:
+def build_scene(seed: int) -> Any:
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    _index[0] = 0
     rng = random.Random(seed)
     scene = bpy.context.scene
     white = new_material("Paint", Base_Color=rgb(0.80, 0.79, 0.76), Roughness=0.45)[0]
@@ -286,18 +274,16 @@ def build_scene(seed: int, transparent: bool = False, caustics: bool = False) ->
 
     # shell: floor, back wall, a left wall with a barred window
     box("Floor", (-4, -5, -0.1), (4, 2.2, 0), wood_floor())
-    if not transparent:
-        wall = wallpaper()
-        box("Back Wall", (-2.1, 2.2, 0), (4, 2.3, 3.4), wall)
-        box("Skirting", (-4, 2.17, 0), (4, 2.2, 0.13), white)
+    wall = wallpaper()
+    box("Back Wall", (-2.1, 2.2, 0), (4, 2.3, 3.4), wall)
+    box("Skirting", (-4, 2.17, 0), (4, 2.2, 0.13), white)
     x0, x1, ya, yb, za, zb = -2.1, -2.0, 0.15, 1.75, 0.85, 2.35
     parts = [
         ((x0, -5, 0), (x1, ya, 3.4)), ((x0, yb, 0), (x1, 2.2, 3.4)),
         ((x0, ya, 0), (x1, yb, za)), ((x0, ya, zb), (x1, yb, 3.4)),
     ]  # fmt: skip
     for k, (lo, hi) in enumerate(parts):
-        if not (transparent and k == 0):
-            box(f"Left Wall {k}", lo, hi, plaster)
+        box(f"Left Wall {k}", lo, hi, plaster)
     for k in range(1, 4):
         y = ya + (yb - ya) * k / 4
         box(f"Bar V{k}", (x0 + 0.03, y - 0.014, za), (x1 - 0.03, y + 0.014, zb), white)
@@ -322,7 +308,7 @@ def build_scene(seed: int, transparent: bool = False, caustics: bool = False) ->
     table = (0.74, 0.62, 0.74)
     cone("Table Leg", 0.20, 0.05, 0.72, oak, (table[0], table[1], 0.36))
     cloth("Tablecloth", tablecloth(), table)
-    sphere("Glass Ball", 0.22, glass(caustics), (table[0] - 0.12, table[1] - 0.14, table[2] + 0.22))
+    sphere("Glass Ball", 0.22, glass(), (table[0] - 0.12, table[1] - 0.14, table[2] + 0.22))
     china = new_material("China", Base_Color=rgb(0.80, 0.82, 0.86), Roughness=0.08)[0]
     sphere("Pearl", 0.085, china, (table[0] + 0.26, table[1] - 0.20, table[2] + 0.085))
     red = new_material("Red Lacquer", Base_Color=rgb(0.62, 0.03, 0.03), Roughness=0.12, Coat_Weight=1.0)[0]
@@ -338,7 +324,7 @@ def build_scene(seed: int, transparent: bool = False, caustics: bool = False) ->
     grass("Grass", rng, blade, (1.62, 0.16, 0.29), radius=0.16, height=0.60)
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=3, radius=0.23, location=(-0.98, -0.30, 0.24))
     globe = bpy.context.object
-    globe.name = "Wire Globe"
+    globe.name, globe.rotation_euler = "Wire Globe", (0.05, 0.0, 0.25)
     wires = globe.modifiers.new("Wireframe", "WIREFRAME")
     wires.thickness = 0.010
     finish(globe, new_material("Steel", Base_Color=rgb(0.75, 0.77, 0.80), Metallic=1.0, Roughness=0.2)[0])
@@ -356,26 +342,25 @@ def build_scene(seed: int, transparent: bool = False, caustics: bool = False) ->
         tube(f"Stay {k}", [tuple(lamp + Vector((0, 0, 0.62))), tuple(edge)], 0.0035, dark)
 
     # picture and shelf on the back wall
-    if not transparent:
-        box("Frame", (-1.55, 2.12, 1.42), (-0.95, 2.2, 2.22), dark)
-        box("Mat", (-1.51, 2.115, 1.46), (-0.99, 2.12, 2.18), white)
-        box("Painting", (-1.44, 2.11, 1.66), (-1.06, 2.115, 2.11), painting())
-        label("LRHS + HRLS", 0.068, dark, (-1.25, 2.112, 1.535))
-        box("Shelf", (0.48, 1.96, 1.38), (1.98, 2.2, 1.42), oak)
-        x = 0.55
-        while x < 1.86:
-            w, h = rng.uniform(0.025, 0.065), rng.uniform(0.24, 0.40)
-            hue = rng.choice([
-                (0.45, 0.08, 0.06), (0.08, 0.16, 0.34), (0.60, 0.47, 0.24),
-                (0.10, 0.25, 0.14), (0.50, 0.50, 0.47), (0.62, 0.28, 0.06),
-            ])  # fmt: skip
-            mat = new_material("Book", Base_Color=rgb(*hue), Roughness=rng.uniform(0.25, 0.7))[0]
-            book = box("Book", (x, 1.99 + rng.uniform(0, 0.03), 1.42), (x + w, 2.17, 1.42 + h), mat)
-            bands = new_material("Band", Base_Color=rgb(0.75, 0.60, 0.25), Metallic=1.0, Roughness=0.3)[0]
-            y = book.location.y - 0.001 - (2.17 - book.location.y)
-            for f in (0.18, 0.80):
-                box("Band", (x + 0.002, y, 1.42 + f * h), (x + w - 0.002, y + 0.002, 1.42 + f * h + 0.013), bands)
-            x += w + rng.uniform(0.002, 0.006)
+    box("Frame", (-1.55, 2.12, 1.42), (-0.95, 2.2, 2.22), dark)
+    box("Mat", (-1.51, 2.115, 1.46), (-0.99, 2.12, 2.18), white)
+    box("Painting", (-1.44, 2.11, 1.66), (-1.06, 2.115, 2.11), painting())
+    label("LRHS + HRLS", 0.068, dark, (-1.25, 2.112, 1.535))
+    box("Shelf", (0.48, 1.96, 1.38), (1.98, 2.2, 1.42), oak)
+    x = 0.55
+    while x < 1.86:
+        w, h = rng.uniform(0.025, 0.065), rng.uniform(0.24, 0.40)
+        hue = rng.choice([
+            (0.45, 0.08, 0.06), (0.08, 0.16, 0.34), (0.60, 0.47, 0.24),
+            (0.10, 0.25, 0.14), (0.50, 0.50, 0.47), (0.62, 0.28, 0.06),
+        ])  # fmt: skip
+        mat = new_material("Book", Base_Color=rgb(*hue), Roughness=rng.uniform(0.25, 0.7))[0]
+        book = box("Book", (x, 1.99 + rng.uniform(0, 0.03), 1.42), (x + w, 2.17, 1.42 + h), mat)
+        bands = new_material("Band", Base_Color=rgb(0.75, 0.60, 0.25), Metallic=1.0, Roughness=0.3)[0]
+        y = book.location.y - 0.001 - (2.17 - book.location.y)
+        for f in (0.18, 0.80):
+            box("Band", (x + 0.002, y, 1.42 + f * h), (x + w - 0.002, y + 0.002, 1.42 + f * h + 0.013), bands)
+        x += w + rng.uniform(0.002, 0.006)
 
     # light: a window-sized area light and the sun outside, a soft fill in front, the sky
     def light(name: str, kind: str, energy: float, color: Point, at: Point, to: Point, **attrs: Any) -> Any:
@@ -411,13 +396,6 @@ def build_scene(seed: int, transparent: bool = False, caustics: bool = False) ->
     back.inputs["Strength"].default_value = 0.62
     world.cycles.sampling_method = "MANUAL"
     world.cycles.sample_map_resolution = 512
-    world.mist_settings.start, world.mist_settings.depth = 2.0, 8.0
-
-    # something moves, so that the Vector pass is not all zero
-    globe.rotation_euler = (0, 0, 0)
-    globe.keyframe_insert("rotation_euler", frame=0)
-    globe.rotation_euler = (0.1, 0.0, 0.5)
-    globe.keyframe_insert("rotation_euler", frame=2)
 
     data = bpy.data.cameras.new("Camera")
     data.lens = 40
@@ -430,14 +408,9 @@ def build_scene(seed: int, transparent: bool = False, caustics: bool = False) ->
 
 
 # ------------------------------------------------------------------- render
-def _components(*kinds: str) -> list[str]:
-    return [f"{kind}_{part}" for kind in kinds for part in ("direct", "indirect", "color")]
-
-
-PASSES_LEAN = ["z", "normal", "cryptomatte_object", *_components("diffuse", "glossy")]
-PASSES_ALL = [
-    *PASSES_LEAN, "mist", "vector", "uv", "position", "object_index", "material_index", *_components("transmission"),
-    "emit", "environment",
+PASSES = [
+    "z", "normal", "cryptomatte_object",
+    *(f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color")),
 ]  # fmt: skip
 
 
@@ -445,48 +418,31 @@ def configure(scene: Any, args: argparse.Namespace) -> None:
     scene.render.engine = "CYCLES"
     c = scene.cycles
     c.device = "CPU"
-    c.use_denoising = False
-    c.use_adaptive_sampling = False
+    c.use_denoising = c.use_adaptive_sampling = c.use_animated_seed = False
     c.sample_clamp_direct = c.sample_clamp_indirect = 0.0
     c.sampling_pattern = "TABULATED_SOBOL"
-    c.use_animated_seed = False
-    c.pixel_filter_type, c.filter_width = args.filter, 1.5
-    c.caustics_reflective = c.caustics_refractive = args.caustics
+    c.pixel_filter_type = "BOX"
+    c.caustics_reflective = c.caustics_refractive = False
     c.max_bounces, c.diffuse_bounces, c.glossy_bounces, c.transmission_bounces = 8, 4, 4, 8
     r = scene.render
     r.threads_mode, r.threads = "FIXED", args.threads
     r.use_persistent_data = True
-    r.use_motion_blur = False
-    r.film_transparent = args.transparent
-    r.resolution_percentage = 100
-    r.dither_intensity = 0.0
-    r.use_compositing = r.use_sequencer = False
+    r.use_motion_blur = r.film_transparent = r.use_compositing = r.use_sequencer = False
+    r.resolution_percentage, r.dither_intensity = 100, 0.0
     image = r.image_settings
-    if V5:
-        image.media_type = "MULTI_LAYER_IMAGE"
-    image.file_format = "OPEN_EXR_MULTILAYER"
-    image.color_depth = "16" if args.half else "32"
-    image.exr_codec = args.codec
-    if V5:
-        image.use_exr_interleave = args.interleave
+    if bpy.app.version >= (5, 0, 0):
+        image.media_type, image.use_exr_interleave = "MULTI_LAYER_IMAGE", False
+    image.file_format, image.color_depth, image.exr_codec = "OPEN_EXR_MULTILAYER", "16", "ZIP"
     layer = scene.view_layers[0]
-    if args.view_layer:
-        layer.name = args.view_layer
-    for flag in PASSES_LEAN if args.lean else PASSES_ALL:
+    for flag in PASSES:
         setattr(layer, f"use_pass_{flag}", True)
     layer.cycles.denoising_store_passes = True
-    layer.cycles.pass_debug_sample_count = not args.lean
-    layer.pass_cryptomatte_depth = 2 if args.lean else 4
+    layer.pass_cryptomatte_depth = 2
 
 
-def render(
-    scene: Any, path: Path, size: tuple[int, int], spp: int, seed: int, border: tuple[float, ...] | None, crop: bool
-) -> None:
+def render(scene: Any, path: Path, size: tuple[int, int], spp: int, seed: int) -> None:
     r = scene.render
     r.resolution_x, r.resolution_y = size
-    r.use_border, r.use_crop_to_border = border is not None, crop
-    if border is not None:
-        r.border_min_x, r.border_min_y, r.border_max_x, r.border_max_y = border
     scene.cycles.samples, scene.cycles.seed = spp, seed
     r.filepath = str(path)
     start = time.time()
@@ -499,31 +455,13 @@ def parse(argv: list[str]) -> argparse.Namespace:
     def size(text: str) -> tuple[int, ...]:
         return tuple(int(v) for v in text.lower().split("x"))
 
-    def border(text: str) -> tuple[float, ...]:
-        return tuple(float(v) for v in text.split(","))
-
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--out", type=Path, required=True, metavar="DIR")
     p.add_argument("--size", type=size, default=(512, 384), metavar="WxH", help="size of the HRLS render")
     p.add_argument("--scale", type=int, default=4, help="LRHS is rendered at 1/scale of the size")
-    p.add_argument("--lr-size", type=size, metavar="WxH", help="size of the LRHS render, over --scale")
     p.add_argument("--hr-spp", type=int, default=1)
     p.add_argument("--lr-spp", type=int, default=16)
     p.add_argument("--ref-spp", type=int, default=0, help="0: no reference")
-    p.add_argument("--only", default="hr,lr,ref", help="which of the renders to make")
-    p.add_argument("--suffix", default="", help="appended to the file names")
-    p.add_argument("--filter", choices=("BOX", "BLACKMAN_HARRIS"), default="BOX")
-    p.add_argument("--transparent", action="store_true", help="transparent film, no back wall")
-    depth = p.add_mutually_exclusive_group()
-    depth.add_argument("--half", dest="half", action="store_true", default=True)
-    depth.add_argument("--float", dest="half", action="store_false")
-    p.add_argument("--codec", default="ZIP")
-    p.add_argument("--interleave", action="store_true", help="Blender 5: one part with every pass")
-    p.add_argument("--border", type=border, metavar="X0,Y0,X1,Y1", help="region in fractions, y upwards")
-    p.add_argument("--crop", action="store_true", help="crop the file to the region")
-    p.add_argument("--lean", action="store_true", help="few passes")
-    p.add_argument("--caustics", action="store_true")
-    p.add_argument("--view-layer", help="name of the view layer")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--threads", type=int, default=1)
     return p.parse_args(argv)
@@ -532,18 +470,17 @@ def parse(argv: list[str]) -> argparse.Namespace:
 def main(argv: list[str]) -> None:
     args = parse(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    scene = build_scene(args.seed, args.transparent, args.caustics)
+    scene = build_scene(args.seed)
     configure(scene, args)
-    wanted = args.only.split(",")
     w, h = args.size
     # rounded up: an LRHS render covers all of the frame
-    low = args.lr_size or (-(-w // args.scale), -(-h // args.scale))
+    low = -(-w // args.scale), -(-h // args.scale)
     # every render has a seed of its own, else the samples of one would be nested in another's
     jobs = [("hr", (w, h), args.hr_spp, 1), ("lr", low, args.lr_spp, 2), ("ref", (w, h), args.ref_spp, 3)]
     for name, size, spp, offset in jobs:
-        if name in wanted and spp > 0:
-            path = args.out.resolve() / f"{name}{args.suffix}.exr"
-            render(scene, path, size, spp, 1000 * args.seed + offset, args.border, args.crop)
+        if spp > 0:
+            path = args.out.resolve() / f"{name}.exr"
+            render(scene, path, size, spp, 1000 * args.seed + offset)
 
 
 if __name__ == "__main__":

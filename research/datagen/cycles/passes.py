@@ -65,7 +65,6 @@ def render(out: Path, seed: int, pixel_filter: str, size: tuple[int, int], refer
     import bpy
 
     from . import scenes
-    from .assets import Assets
     from .render import Renderer, find_cameras
 
     folder = out / f"cycles_{seed}_{pixel_filter.lower()}"
@@ -75,7 +74,7 @@ def render(out: Path, seed: int, pixel_filter: str, size: tuple[int, int], refer
     missing = [job for job in jobs if not (folder / f"{job[0]}.exr").exists()]
     if not missing:
         return
-    stage = scenes.build(seed, Assets(None))
+    stage = scenes.build(seed)
     stage.caustics = False
     group_lights(stage.scene)  # before the first render, because persistent data does not notice new groups
     with tempfile.TemporaryDirectory() as scratch:

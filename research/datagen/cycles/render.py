@@ -16,7 +16,6 @@ from oiio_msspl.model.contract import SCALES
 from research.datagen import quality, views
 
 from . import scenes
-from .assets import Assets
 
 _ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most rendered in full
 # By split: samples are added until a reference reaches the first PSNR [dB], up to the third figure times `ref_spp`. A
@@ -171,13 +170,13 @@ def render_view(
         "seed": f"cycles-{seed}", "view": view, "split": views.split_of(seed), "generator": scenes.VERSION,
         "kind": stage.kind, "renderer": f"Blender {bpy.app.version_string} Cycles", **renderer.settings,
         "filter": _FILTERS[pixel_filter], "lr_filter": _FILTERS[lr_filter], "ref_spp": spent, "ref_psnr": psnr,
-        "assets": sorted(stage.sources), "camera": camera,
+        "camera": camera,
     }  # fmt: skip
     return views.pack(hr, lr, ref, rng, meta)
 
 
 def render_scene(
-    out: Path, seed: int, assets: Assets, count: int, ref_spp: int, threads: int, filter_name: str | None
+    out: Path, seed: int, count: int, ref_spp: int, threads: int, filter_name: str | None
 ) -> tuple[int, str]:
     """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene.
 
@@ -188,7 +187,7 @@ def render_scene(
     missing = [v for v in range(count) if not views.path_of(out, "cycles", seed, v).exists()]
     if not missing:
         return 0, "done before"
-    stage = scenes.build(seed, assets)
+    stage = scenes.build(seed)
     written = 0
     shared = Path("/dev/shm")  # a RAM disk, on Linux
     with tempfile.TemporaryDirectory(prefix="cycles-views-", dir=shared if shared.is_dir() else None) as scratch:

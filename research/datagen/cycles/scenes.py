@@ -19,7 +19,6 @@ from research.datagen import meshes as geo
 from research.datagen import textures as tex
 
 from . import materials as mat
-from .assets import Assets
 from .geometry import blender_mesh
 from .materials import Rng, chance, log_uniform
 from .stage import Stage
@@ -39,7 +38,7 @@ def daylight(s: Stage) -> None:
     """Build a closed room lit by sun and sky through small openings."""
     rng = s.rng
     s.room(_size(rng), int(rng.integers(2, 8)), 0.75)
-    s.sky(log_uniform(rng, 0.5, 3), 0.3, 0.7)
+    s.sky(log_uniform(rng, 0.5, 3), 0.7)
     if chance(rng, 0.7):
         s.portals()
     s.furnish(int(rng.integers(3, 9)))
@@ -63,7 +62,7 @@ def many_lights(s: Stage) -> None:
     """Dozens of small lights and shiny things."""
     rng = s.rng
     s.room(_size(rng), int(chance(rng, 0.3)))
-    s.sky(log_uniform(rng, 0.01, 0.1), 0.3, 0.0)
+    s.sky(log_uniform(rng, 0.01, 0.1), 0.0)
     s.furnish(int(rng.integers(2, 7)))
     s.clutter(1, 5, shiny=0.45)
     for _ in range(rng.integers(1, 4)):
@@ -77,7 +76,7 @@ def glassware(s: Stage) -> None:
     rng = s.rng
     s.caustics = chance(rng, 0.8)
     s.room(_size(rng, 2.5, 4.5), int(chance(rng, 0.3)))
-    s.sky(log_uniform(rng, 0.1, 1), 0.5)
+    s.sky(log_uniform(rng, 0.1, 1))
     s.add(geo.table(1.8, 1.2, 0.75, 0.07), mat.paint(rng, 0.2, 2))
     s.tops.append((np.array([0, 0, 0.75]), 0.6, 0.4))
     s.clutter(4, 12, shiny=0.25, clear=0.55)
@@ -92,7 +91,7 @@ def corridor(s: Stage) -> None:
     rng = s.rng
     length, width = rng.uniform(6, 12), rng.uniform(1.6, 3.5)
     s.room((width, length, rng.uniform(2.4, 4)), int(rng.integers(0, 3)), 0.8)
-    s.sky(log_uniform(rng, 0.3, 3), 0.3, 0.9)
+    s.sky(log_uniform(rng, 0.3, 3), 0.9)
     material = mat.paint(rng, 0.4, 2, True)
     for y in np.arange(-length / 2 + 1, length / 2 - 0.5, rng.uniform(0.8, 2)):
         r = rng.uniform(0.06, 0.2)
@@ -116,7 +115,7 @@ def corridor(s: Stage) -> None:
 def outdoors(s: Stage) -> None:
     """Ground with grass, trees, rocks, fences and walls under a sky."""
     rng = s.rng
-    s.sky(1.0, 0.45)
+    s.sky(1.0)
     n = 120
     x, y = np.meshgrid(np.linspace(-15, 15, n), np.linspace(-15, 15, n), indexing="ij")
     low = 0.25 * rng.random()
@@ -211,7 +210,7 @@ def studio(s: Stage) -> None:
     x, t = np.meshgrid(np.linspace(-8, 8, 20), np.linspace(0, 1, 60), indexing="ij")
     profile_y, profile_z = (np.interp(t, [0, 0.6, 0.75, 1], ends) for ends in ([-6, 3, 4, 4.2], [0, 0, 0.8, 6]))
     s.add(geo.surface(np.stack([x, profile_y, profile_z], -1), np.stack([x, t * 12], -1)), mat.paint(rng, 0.6, 1))
-    s.sky(log_uniform(rng, 0.05, 1), 0.8, 0.3)
+    s.sky(log_uniform(rng, 0.05, 1), 0.3)
     for _ in range(rng.integers(1, 4)):
         a = rng.uniform(0, 6.3)
         at = np.array([math.cos(a) * 2.5, math.sin(a) * 2.5, rng.uniform(1.5, 3.5)])
@@ -227,7 +226,7 @@ def studio(s: Stage) -> None:
 def abstract(s: Stage) -> None:
     """Build a swarm of floating copies of a few shapes, as in motion graphics."""
     rng = s.rng
-    s.sky(log_uniform(rng, 0.02, 1), 0.7, 0.5)
+    s.sky(log_uniform(rng, 0.02, 1), 0.5)
     meshes = [
         geo.block(1, 1, 1),
         geo.sphere(0.5, 24),
@@ -262,11 +261,11 @@ KINDS: dict[Callable[[Stage], None], float] = {
 }  # fmt: skip
 
 
-def build(seed: int, assets: Assets) -> Stage:
+def build(seed: int) -> Stage:
     """Fill an empty Blender file with the scene of a seed."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     rng = np.random.default_rng([seed, VERSION])
-    stage = Stage(rng, assets)
+    stage = Stage(rng)
     kind = list(KINDS)[rng.choice(len(KINDS), p=np.array(list(KINDS.values())) / sum(KINDS.values()))]
     stage.kind = kind.__name__
     kind(stage)

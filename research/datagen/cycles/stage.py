@@ -17,7 +17,6 @@ from research.datagen import textures as tex
 from research.datagen.meshes import Mesh
 
 from . import materials as mat
-from .assets import Assets, licence_of, load_model
 from .geometry import blender_mesh, from_bmesh, strands
 from .materials import Material, Rng, chance, log_uniform
 
@@ -25,10 +24,8 @@ from .materials import Material, Rng, chance, log_uniform
 class Stage:
     """A Blender scene under construction, and what a camera may look at."""
 
-    def __init__(self, rng: Rng, assets: Assets) -> None:
-        self.rng, self.assets = rng, assets
-        self.kind = ""
-        self.sources: set[str] = set()
+    def __init__(self, rng: Rng) -> None:
+        self.rng, self.kind = rng, ""
         self.focus: list[np.ndarray] = []  # points worth looking at
         self.tops: list[tuple[np.ndarray, float, float]] = []  # surfaces to put things on: centre, half sizes
         self.bounds: tuple[np.ndarray, np.ndarray] | None = None  # of the room that cameras stay in
@@ -87,22 +84,14 @@ class Stage:
 
     # -- surroundings ------------------------------------------------------------------------------
 
-    def sky(self, strength: float = 1.0, hdri: float = 0.4, sun: float = 0.75) -> None:
-        """Add a world: an HDRI, or Blender's sky or a gradient with a sun lamp."""
+    def sky(self, strength: float = 1.0, sun: float = 0.75) -> None:
+        """Add a world: Blender's sky, or a gradient with a sun lamp."""
         rng = self.rng
         world = bpy.data.worlds.new("world")
         self.scene.world = world
         world.cycles.sampling_method, world.cycles.sample_map_resolution = "MANUAL", 512
         graph = mat.Graph(world)
-        if self.assets.hdris and chance(rng, hdri):
-            path = self.assets.hdris[rng.integers(len(self.assets.hdris))]
-            self.sources.add(f"hdri/{path.name} (CC0, Poly Haven)")
-            coords = graph.add("ShaderNodeTexCoord").outputs["Generated"]
-            turned = graph.add("ShaderNodeMapping", {"Vector": coords, "Rotation": (0, 0, rng.uniform(0, 6.3))})
-            node = graph.add("ShaderNodeTexEnvironment", {"Vector": turned.outputs[0]})
-            node.image = bpy.data.images.load(str(path), check_existing=True)
-            color = node.outputs["Color"]
-        elif chance(rng, 0.5):
+        if chance(rng, 0.5):
             node = graph.add(
                 "ShaderNodeTexSky", sky_type="SINGLE_SCATTERING", sun_disc=chance(rng, sun),
                 sun_elevation=rng.uniform(0.03, 1.2), sun_rotation=rng.uniform(0, 6.3),
@@ -144,7 +133,6 @@ class Stage:
         makers: dict[Callable[[np.ndarray, float], None], float] = {
             self._fur: 0.06, self._wires: 0.07, self._cage: 0.06, self._plant: 0.12, self._heap: 0.06,
             self._letters: 0.05, self._chain: 0.04, self._candle: 0.04,
-            self._model: 0.14 if self.assets.models else 0,
         }  # fmt: skip
         pick = rng.random()
         for make, share in makers.items():
@@ -300,17 +288,6 @@ class Stage:
             flame = geo.sphere(1, 12).scaled((0.06 * size, 0.06 * size, 0.14 * size)).moved(0, 0, h + 0.1 * size)
             self.emitter(flame, log_uniform(rng, 0.05, 1.0), np.array([1, 0.5, 0.15]), at)
 
-    def _model(self, at: np.ndarray, size: float) -> None:
-        rng = self.rng
-        path = self.assets.model(rng)
-        self.sources.add(licence_of(path))
-        self._stand(load_model(path), at, size * 1.6, rng.uniform(0, 6.3))
-
-    def _stand(self, parts: list[bpy.types.Object], at: np.ndarray, size: float, angle: float) -> None:
-        move = Matrix.Translation(Vector(at)) @ Matrix.Rotation(angle, 4, "Z") @ Matrix.Scale(size, 4)
-        for o in parts:
-            o.matrix_world = move @ o.matrix_world
-
     def furniture(self, at: np.ndarray, angle: float) -> None:
         """Something that stands on a floor."""
         rng, kind = self.rng, self.rng.random()
@@ -320,23 +297,7 @@ class Stage:
         def build(mesh: Mesh, material: Material) -> None:
             self.place(blender_mesh(mesh), material, spin)
 
-        if self.assets.furniture and kind < 0.35:
-            path = self.assets.furniture[rng.integers(len(self.assets.furniture))]
-            self.sources.add(licence_of(path))
-            parts = load_model(path)
-            if chance(rng, 0.6):  # else the one palette that all the files share
-                material = (
-                    mat.palette(rng)
-                    if chance(rng, 0.5)
-                    else mat.cloth(rng)
-                    if chance(rng, 0.5)
-                    else mat.paint(rng, 0.3, 3)
-                )
-                for o in parts:
-                    o.data.materials.clear()
-                    o.data.materials.append(material)
-            self._stand(parts, at, rng.uniform(0.6, 1.5), angle)
-        elif kind < 0.55:
+        if kind < 0.55:
             w, d, h = rng.uniform(0.5, 1.8), rng.uniform(0.5, 0.9), rng.uniform(0.35, 0.9)
             build(
                 geo.table(w, d, h, rng.uniform(0.015, 0.08)),

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
-from research.datagen import command_line, views
+from research.datagen import command_line
 
 from . import start
 
@@ -13,13 +14,10 @@ from . import start
 def main() -> int:
     """Run the command line and return the exit code."""
     parser = command_line.parser("research.datagen.mitsuba", "Render training views with Mitsuba 3.", ref_spp=96)
-    parser.add_argument("--variant", default=start.VARIANT, help="of Mitsuba (default: %(default)s)")
     parser.add_argument(
-        "--filter",
-        choices=views.FILTERS,
-        default="box",
-        help="pixel filter of both renders; blackman-harris is 1 to 3.2 pixels wide (default: %(default)s)",
+        "--assets", type=Path, help="folder with hdri/ and models/; without it all content is procedural"
     )
+    parser.add_argument("--variant", default=start.VARIANT, help="of Mitsuba (default: %(default)s)")
     args = parser.parse_args()
     start.start(args.threads, args.variant)
     # These modules name Mitsuba's types, which exist only after a variant is set.
@@ -27,9 +25,7 @@ def main() -> int:
     from .render import render_scene
 
     assets = Assets(args.assets)
-    return command_line.render_all(
-        args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp, args.filter)
-    )
+    return command_line.render_all(args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp))
 
 
 if __name__ == "__main__":

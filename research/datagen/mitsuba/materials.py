@@ -18,17 +18,12 @@ Bsdf = dict
 _METALS = ["Au", "Cu", "Al", "Cr", "Ag", "W", "none"]
 
 
-def bitmap(image: np.ndarray, nearest: bool = False) -> dict:
+def bitmap(image: np.ndarray) -> dict:
     """Return a texture of linear values; (H, W) or (H, W, C)."""
     image = np.ascontiguousarray(np.atleast_3d(image), np.float32)
     if min(image.shape[:2]) < 2:
         image = image.repeat(2, 0).repeat(2, 1)
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(image),
-        "raw": True,
-        "filter_type": "nearest" if nearest else "bilinear",
-    }
+    return {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True, "filter_type": "bilinear"}
 
 
 def _both_sides(bsdf: Bsdf) -> Bsdf:

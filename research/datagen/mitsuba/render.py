@@ -10,17 +10,15 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from oiio_msspl.model.contract import SCALES
 from research.datagen import quality, views
 
 from . import scenes
 from .assets import Assets
-from .trace import MAX_DEPTH, Camera, PixelFilter, blackman_harris, box, render_passes
+from .trace import MAX_DEPTH, Camera, render_passes
 
 _ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most rendered in full
 _GOOD_REFERENCE, _WORST_REFERENCE = 27.0, 21.0  # dB, of the reference's own noise
 _BATCH = 16  # samples a pixel per wavefront: bounds the memory
-_WIDTHS = (1.0, 3.2)  # of the Blackman-Harris filter in pixels; Blender's default is 1.5, other renderers use up to 3
 
 
 def find_cameras(scene: mi.Scene, plan: scenes.Scene, seed: int, view: int, lit_share: float = 0.6) -> Iterator[Camera]:
@@ -44,9 +42,7 @@ def _distance(scene: mi.Scene, camera: Camera) -> float:
     return float(np.percentile(np.minimum(t, 1e3), 10))
 
 
-def _reference(
-    scene: mi.Scene, camera: Camera, spp: int, seed: int, pixel_filter: PixelFilter
-) -> tuple[np.ndarray, int, float] | None:
+def _reference(scene: mi.Scene, camera: Camera, spp: int, seed: int) -> tuple[np.ndarray, int, float] | None:
     """Render a reference with `spp` samples a pixel, or with twice as many if it is still noisy.
 
     Returns:
@@ -60,9 +56,7 @@ def _reference(
 
     while True:
         for half in range(2):
-            passes = render_passes(
-                scene, camera, views.SIZE, _BATCH, seed + done + half, layers=False, pixel_filter=pixel_filter
-            )
+            passes = render_passes(scene, camera, views.SIZE, _BATCH, seed + done + half, layers=False)
             halves[half] += passes.sum(0, dtype=np.float64)
         done += 2 * _BATCH
         if done == 2 * _BATCH and psnr() + 10 * np.log10(2 * spp / done) < _WORST_REFERENCE:
@@ -71,44 +65,32 @@ def _reference(
             return halves.sum(0) / done, done, psnr()
 
 
-def _lrhs(scene: mi.Scene, camera: Camera, scale: int, seed: int, pixel_filter: PixelFilter) -> np.ndarray:
-    """Render the `lr` passes at 1/scale of the resolution with scale² times the samples: (Q, H/s, W/s, 3)."""
-    renders = (
-        render_passes(scene, camera, views.SIZE // scale, scale**2 * n, seed + i, False, pixel_filter=pixel_filter)
-        for i, n in enumerate(views.LR_SPP)
-    )
-    return np.stack([passes.mean(0) for passes in renders])
-
-
 def render_view(
-    scene: mi.Scene, plan: scenes.Scene, camera: Camera, seed: int, view: int, ref_spp: int, filter_name: str
+    scene: mi.Scene, plan: scenes.Scene, camera: Camera, seed: int, view: int, ref_spp: int
 ) -> dict[str, np.ndarray] | None:
     """Render all arrays of one view, see :mod:`research.datagen.views`; None if the reference stays too noisy."""
     rng = np.random.default_rng([seed, view, 7])
     # Each of the three independent renders gets 1000 seeds of its own.
     base = [int(s) * 1000 for s in rng.choice(4_000_000, 3, replace=False)]
-    width = float(np.random.default_rng([seed, 8]).uniform(*_WIDTHS))  # the same for all views of a scene
-    pixel_filter = box if filter_name == "box" else blackman_harris(width)
-    reference = _reference(scene, camera, ref_spp, base[0], pixel_filter)
+    reference = _reference(scene, camera, ref_spp, base[0])
     if reference is None:
         return None
     ref, ref_spp, psnr = reference
-    hr = render_passes(scene, camera, views.SIZE, views.HR_PASSES, base[1], pixel_filter=pixel_filter)
-    # Box-filtered passes at full resolution give the LRHS of every scale. A wider filter needs a render per scale.
-    scales = (1,) if pixel_filter is box else SCALES
-    lr = {scale: _lrhs(scene, camera, scale, base[2] + 100 * scale, pixel_filter) for scale in scales}
-
+    hr = render_passes(scene, camera, views.SIZE, views.HR_PASSES, base[1])
+    # Box-filtered passes at full resolution give the LRHS of every scale.
+    seeds = enumerate(views.LR_SPP, start=base[2] + 100)
+    lr = np.stack([render_passes(scene, camera, views.SIZE, n, seed, layers=False).mean(0) for seed, n in seeds])
     meta = {
         "seed": seed, "view": view, "split": views.split_of(seed), "generator": scenes.VERSION, "kind": plan.kind,
         "renderer": f"Mitsuba {mi.__version__}, variant {mi.variant()}, own path tracer, {MAX_DEPTH} bounces",
-        "sampler": "independent", "filter": filter_name if pixel_filter is box else f"{filter_name} {width:.2f}",
+        "sampler": "independent", "filter": "box",
         "ref_spp": ref_spp, "ref_psnr": psnr,
         "assets": sorted(plan.sources), "camera": camera.__dict__,
     }  # fmt: skip
-    return views.pack(hr, lr, ref, rng, meta)
+    return views.pack(hr, {1: lr}, ref, rng, meta)
 
 
-def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int, filter_name: str) -> tuple[int, str]:
+def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int) -> tuple[int, str]:
     """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene."""
     missing = [v for v in range(count) if not views.path_of(out, "mitsuba", seed, v).exists()]
     if not missing:
@@ -117,7 +99,7 @@ def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int,
     written = 0
     for view in missing:
         cameras = find_cameras(scene, plan, seed, view)
-        renders = (render_view(scene, plan, c, seed, view, ref_spp, filter_name) for c in cameras)
+        renders = (render_view(scene, plan, c, seed, view, ref_spp) for c in cameras)
         arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
         if arrays is None:
             continue

@@ -156,6 +156,9 @@ def main() -> int:
     parser = command_line.parser(
         "research.datagen.mitsuba.render_samples", "Render training views that keep their samples.", ref_spp=48
     )
+    parser.add_argument(
+        "--assets", type=Path, help="folder with hdri/ and models/; without it all content is procedural"
+    )
     parser.add_argument("--rooms", type=Path, help="folder with bathroom2/ and living-room-3/, Mitsuba scenes")
     parser.add_argument("--kind", help="of scenes, only those of this one, such as ajar_room")
     parser.add_argument("--max-gib", type=float, default=6.0, help="start no new scene above this size (%(default)s)")

@@ -190,18 +190,16 @@ def render_samples(
     spp: int,
     seed: int,
     layers: tuple[str, ...] = LAYERS,
-    integrator: mi.Integrator | None = None,
     pixel_filter: PixelFilter = box,
 ) -> dict[str, np.ndarray]:
     """Render `spp` samples for every pixel, each with its place: float32 (spp, height, width, C) by name.
 
     The names are `place` (x and y in the pixel, 0 to 1 for a box) and those of `layers`, see `LAYERS`. A `size` is that
-    of a square, or width and height. An `integrator` of Mitsuba replaces the one here (colour only), for comparisons.
-    Samples with a non-finite value are zero.
+    of a square, or width and height. Samples with a non-finite value are zero.
     """
     columns, rows = (size, size) if isinstance(size, int) else size
     pixel = dr.arange(mi.UInt32, columns * rows * spp) % dr.opaque(mi.UInt32, columns * rows)
-    wanted = _trace(scene, camera, columns, rows, pixel, seed, layers, integrator, pixel_filter)
+    wanted = _trace(scene, camera, columns, rows, pixel, seed, layers, pixel_filter)
     dr.eval([channel for channels in wanted.values() for channel in channels])
     out = {name: np.stack([c.numpy() for c in channels], axis=-1) for name, channels in wanted.items()}
     finite = np.logical_and.reduce([np.isfinite(values).all(axis=-1) for values in out.values()])
@@ -218,7 +216,7 @@ def render_sum(
     Samples with a non-finite value count as zero.
     """
     pixel = dr.arange(mi.UInt32, size * size * spp) // dr.opaque(mi.UInt32, spp)
-    traced = _trace(scene, camera, size, size, pixel, seed, layers, None, box)
+    traced = _trace(scene, camera, size, size, pixel, seed, layers, box)
     channels = [channel for name in layers for channel in traced[name]]
     finite = mi.Bool(True)
     for channel in channels:
@@ -231,7 +229,7 @@ def render_sum(
 
 def _trace(
     scene: mi.Scene, camera: Camera, columns: int, rows: int, pixel: mi.UInt32, seed: int,
-    layers: tuple[str, ...], integrator: mi.Integrator | None, pixel_filter: PixelFilter,
+    layers: tuple[str, ...], pixel_filter: PixelFilter,
 ) -> dict[str, list[mi.Float]]:  # fmt: skip
     """Trace one sample of each of these pixels, not evaluated yet: its channels by name, see :func:`render_samples`."""
     sampler = mi.load_dict({"type": "independent"})
@@ -243,28 +241,16 @@ def _trace(
     x = (mi.Float(pixel - row * width) + place[0]) / mi.Float(width)
     y = (mi.Float(row) + place[1]) / mi.Float(height)
     ray = camera.rays(x, y, lens)
-    if integrator is not None:
-        traced = {"color": list(integrator.sample(scene, sampler, ray)[0])}
-    else:
-        *vectors, distance = sample_layers(scene, sampler, ray)
-        traced = dict(zip(LAYERS, [*map(list, vectors), [distance]], strict=True))
+    *vectors, distance = sample_layers(scene, sampler, ray)
+    traced = dict(zip(LAYERS, [*map(list, vectors), [distance]], strict=True))
     return {"place": place} | {name: traced[name] for name in layers}
 
 
-def render_passes(
-    scene: mi.Scene,
-    camera: Camera,
-    size: int | tuple[int, int],
-    spp: int,
-    seed: int,
-    layers: bool = True,
-    integrator: mi.Integrator | None = None,
-    pixel_filter: PixelFilter = box,
-) -> np.ndarray:
+def render_passes(scene: mi.Scene, camera: Camera, size: int, spp: int, seed: int, layers: bool = True) -> np.ndarray:
     """Render `spp` independent 1-spp passes: float32 (spp, height, width, C), as `render_samples` without places.
 
     C is 15 with `layers` (colour, albedo, normal, diffuse, specular), 3 without.
     """
-    names = LAYERS[:5] if layers and integrator is None else LAYERS[:1]
-    samples = render_samples(scene, camera, size, spp, seed, names, integrator, pixel_filter)
+    names = LAYERS[:5] if layers else LAYERS[:1]
+    samples = render_samples(scene, camera, size, spp, seed, names)
     return np.concatenate([samples[name] for name in names], axis=-1)

@@ -41,9 +41,12 @@ class Nodes:
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.ModelProto:
         """Return the model."""
-        values = (numpy_helper.from_array(np.asarray(v), k) for k, v in self.initializers.items())
-        graph = helper.make_graph(self.nodes, name, inputs, outputs, [*values, *self.embedded])
+        graph = helper.make_graph(self.nodes, name, inputs, outputs, [*self.constants(), *self.embedded])
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+
+    def constants(self) -> list[onnx.TensorProto]:
+        """Return the constants."""
+        return [numpy_helper.from_array(np.asarray(values), name) for name, values in self.initializers.items()]
 
     def embed(self, model: onnx.ModelProto, prefix: str, names: dict[str, str]) -> None:
         """Add the graph of a model.

@@ -20,6 +20,7 @@ from oiio_msspl.fusion.tiles import tiling
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.fusion.tiles.prepare import FramePair
+from oiio_msspl.image import arrays
 from oiio_msspl.jobs import settings
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
@@ -681,6 +682,29 @@ def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models, monkeyp
     assert times[1] > 1.5 * times[0]
     for (_, first), (_, second) in zip(*results, strict=True):
         assert all(same_bits(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("quality", ["best", "fast"])
+def test_a_small_hrls_is_decoded_once_and_copied_once(tmp_path, monkeypatch, quality):
+    """The noise check, the network and the passes share what is decoded. As a large frame, it has the same result."""
+    pair = write_pair(tmp_path, lights())
+    (part,) = open_exr(pair[1]).parts
+    decode, decoded, results = ExrFile._decode, [], []
+
+    def count(file, *given):
+        rows = decode(file, *given)
+        decoded.append(rows.size if file.path == pair[1] else 0)
+        return rows
+
+    monkeypatch.setattr(ExrFile, "_decode", count)
+    for most in (arrays.MOST_PIXELS, 1000):
+        monkeypatch.setattr(arrays, "MOST_PIXELS", most)
+        fuse_files(*pair, tmp_path / "out.exr", model=quality, overwrite=True)
+        results.append((read_bits(tmp_path / "out.exr"), sum(decoded) / (len(part.channels) * HEIGHT * WIDTH)))
+        decoded.clear()
+    (small, large), reads = zip(*results, strict=True)
+    assert reads[0] <= 2 < reads[1]
+    assert all(same_bits(small[0][1][name], large[0][1][name]) for name in small[0][1])
 
 
 @pytest.mark.parametrize("by_network", [False, True])

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gives back what both renders show and the network has removed.
+
+Where the renders have many samples, a network erases detail that no AOV shows. The difference between the HRLS and the
+fused picture is noise and lost detail. The pair tells them apart: both renders are independent, so the difference of
+the LRHS to the means of the HRLS is the noise of the two. Where the fused picture differs by more than that noise
+explains, a part of the difference is put back, as much as James and Stein's estimator keeps (Gu et al. 2022,
+*Neural James-Stein Combiner*, without a network). A test of significance decides first, so that chance and fireflies
+are not taken for detail (Firmino et al. 2022, *Progressive Denoising of Monte Carlo Rendered Images*).
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+
+from oiio_msspl.image.arrays import Array, planes_of
+from oiio_msspl.image.filters import blurred, box_downsample, max_around, means_around, upsample_linear
+from oiio_msspl.image.parallel import for_row_blocks
+
+#: Reach of the windows in which energies are compared, in LRHS pixels, and the t that leaves no doubt. Large windows
+#: find faint detail, small ones find where it ends. They hold fewer pixels, but also fewer kinds of noise.
+WINDOWS = ((3, 4.0), (7, 5.0), (15, 5.0))
+#: The t below which a difference is taken for noise.
+DOUBTFUL = 3.0
+#: Exposed radiance that is added to the local brightness, so that dark noise does not count as much as light.
+DARKEST = 0.02
+#: Squared difference relative to the local brightness, and to s^2, that counts at most: a firefly is one pixel.
+LARGEST = 16.0
+#: A pixel is judged by itself where the mean amplitude around is this many times that of the noise: scattered points.
+#: It is also judged where its energy is this many times the largest noise around: a lamp alone.
+SPARSE, ALONE = 1.5, 16.0
+#: Noise counts this many times where a pixel is judged by itself.
+PIXEL = 4.0
+#: Error of a half float, relative to its value.
+ROUNDING = 2.0**-12
+#: Reach of the windows of the light's correction, in pixels of each level, and its largest factor.
+LIGHT_REACH, LARGEST_FACTOR = 3, 2.0
+#: Pixels do not count for the light around them if both renders are brighter by this many times the local brightness:
+#: a lamp that the network has removed.
+LAMP = 1.0
+
+
+class Renders(NamedTuple):
+    """Both renders of a tile, and what is known of their noise."""
+
+    lrhs: Array
+    """(h, w, c), scene linear."""
+    hrls: Array
+    """(s*h, s*w, c), scene linear. At scale 1, the second render of the same size."""
+    share: float
+    """Share of the LRHS in the mean of both renders that has the least noise."""
+    exposure: float
+    """Factor that brings the scene to a log-mean luminance of mid-grey."""
+
+    @property
+    def scale(self) -> int:
+        """HRLS pixels along a side of an LRHS pixel."""
+        return len(self.hrls) // len(self.lrhs)
+
+
+def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Array]:
+    """Put back detail and light that both renders show.
+
+    Detail is taken from the HRLS, or from the mean of two renders of one size.
+
+    Args:
+        fused: the network's picture (s*h, s*w, c), scene linear.
+        renders: the renders of the tile, without fireflies.
+        reach: the largest distance, in LRHS pixels, over which a pixel may depend on others.
+
+    Returns:
+        The picture (s*h, s*w, c), >= 0, and how much of the HRLS's difference was put back, (h, w) in [0, 1].
+    """
+    picture, low, high = (planes_of(image) for image in (fused, renders.lrhs, renders.hrls))
+    means = np.stack([box_downsample(plane, renders.scale) for plane in high])
+    if renders.scale == 1:
+        high = high + np.float32(renders.share) * (low - high)
+    trust, points = _trust_in_detail(picture, low, high, means, renders, reach)
+    result = np.empty_like(picture)
+    for plane, detailed, lrhs, mean, target in zip(picture, high, low, means, result, strict=True):
+        _blend(plane, detailed, trust, points, target)
+        _correct_light(target, lrhs, mean, renders, reach)
+    return np.moveaxis(result, 0, -1), trust
+
+
+def _trust_in_detail(
+    fused: Array, lrhs: Array, detailed: Array, means: Array, renders: Renders, reach: int
+) -> tuple[Array, Array]:
+    """Return how much of the difference between a render and the fused picture is detail, (h, w) in [0, 1].
+
+    The second result is the part of it that is judged pixel by pixel.
+
+    Args:
+        fused, lrhs, detailed: planes (c, h, w) or (c, s*h, s*w).
+        means: those of the HRLS over LRHS pixels.
+        renders, reach: as in :func:`trust_renders`.
+    """
+    scale = renders.scale
+    brightness = _brightness(box_downsample(fused.mean(axis=0), scale), renders.exposure)
+    weight = np.divide(np.float32(1 / len(fused)), np.square(brightness), dtype=np.float32)
+    squares = reduce(np.add, (np.square(a - b) for a, b in zip(detailed, fused, strict=True)))
+    energy: Array = weight * box_downsample(squares, scale)
+    # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of
+    # the mean of both renders is E d^2 share (1 - share).
+    factor = np.float32(renders.share * (scale**2 if scale > 1 else 1 - renders.share))
+    noise: Array = factor * weight * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
+    windows = [(size, certain) for size, certain in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
+    sizes = [size for size, _ in windows]
+    most = np.float32(LARGEST * scale**2)
+    e, v = np.minimum(energy, most), np.minimum(noise, most)
+    energies, noises, fourth_powers = (means_around(plane, sizes) for plane in (e, v, e * e + v * v))
+    trust = np.zeros_like(energy)
+    for window, mean, noise_mean, squared in zip(windows, energies, noises, fourth_powers, strict=True):
+        part = _certainty(mean - noise_mean, squared, *window) * _kept(mean, noise_mean)
+        np.maximum(trust, means_around(part, [window[0]])[0], out=trust)
+    amplitude = means_around(np.sqrt(e) - np.float32(SPARSE) * np.sqrt(v), sizes[-1:])[0]
+    scattered = _certainty(amplitude, energies[-1] + noises[-1], *windows[-1])
+    alone = _kept(energy, np.float32(ALONE) * max_around(noise, sizes[-1]))
+    points = np.maximum(scattered, alone) * _kept(energy, np.float32(PIXEL) * noise)
+    return np.maximum(trust, points), points
+
+
+def _certainty(excess: Array, squares: Array, size: int, certain: float) -> Array:
+    """Return how certain it is that the mean of a window exceeds 0: from 0 at ``DOUBTFUL`` to 1 at ``certain``.
+
+    Args:
+        excess: the mean.
+        squares: the mean of the values' squares.
+        size: reach of the window.
+    """
+    error = np.sqrt(np.maximum(squares, 0) / np.float32((2 * size + 1) ** 2))
+    t = excess / np.maximum(error, np.float32(1e-12))
+    return np.clip((t - np.float32(DOUBTFUL)) / np.float32(certain - DOUBTFUL), 0, 1)
+
+
+def _kept(energy: Array, noise: Array) -> Array:
+    """Return the factor ``1 - noise / energy`` of James and Stein, in [0, 1]."""
+    return np.clip((energy - noise) / np.maximum(energy, np.float32(1e-12)), 0, 1)
+
+
+def _brightness(mean: Array, exposure: float) -> Array:
+    """Return the local brightness (h, w) of a picture at the LRHS's resolution."""
+    return blurred(mean, 2) + np.float32(DARKEST / exposure)
+
+
+def _squared_noise(lrhs: Array, mean: Array) -> Array:
+    """Return the squared difference of the renders (h, w), and of the rounding of both to half floats."""
+    return np.square(lrhs - mean) + np.float32(2 * ROUNDING**2) * np.square(np.maximum(lrhs, mean))
+
+
+def _blend(fused: Array, render: Array, trust: Array, points: Array, target: Array) -> None:
+    """Fill ``target`` with ``fused`` and a part of its difference to a render, planes (s*h, s*w).
+
+    The part is ``trust`` (h, w), interpolated, and at least ``points`` (h, w) over a whole LRHS pixel.
+    """
+    scale = len(render) // len(trust)
+
+    def work(rows: slice) -> None:
+        place = slice(rows.start // scale, rows.stop // scale)
+        weight = upsample_linear(trust, scale, place)
+        np.maximum(weight, points[place].repeat(scale, axis=0).repeat(scale, axis=1), out=weight)
+        target[rows] = fused[rows] + weight * (render[rows] - fused[rows])
+
+    for_row_blocks(work, len(render), render.shape[1], multiple=scale)
+
+
+def _correct_light(picture: Array, lrhs: Array, mean: Array, renders: Renders, reach: int) -> None:
+    """Bring the light of a picture (s*h, s*w) to that of both renders where they agree that it differs.
+
+    The differences of the renders to the picture are divided into levels of resolution, and each is shrunk by its own
+    evidence: the light of large areas is known best. The picture is multiplied, so its detail stays.
+    """
+    scale = renders.scale
+    own = box_downsample(picture, scale)
+    brightness = _brightness(own, renders.exposure)
+    low, high = (lrhs - own) / brightness, (mean - own) / brightness
+    lamps = np.minimum(low, high) > LAMP
+    low[lamps] = high[lamps] = 0
+    levels = 1
+    while LIGHT_REACH * 2 ** (levels + 1) <= reach:
+        levels += 1
+    change = brightness * _agreed(low, high, np.float32(renders.share), levels) / np.maximum(own, 0.01 * brightness)
+    factor = np.clip(1 + change, 1 / LARGEST_FACTOR, LARGEST_FACTOR).astype(np.float32)
+
+    def work(rows: slice) -> None:
+        picture[rows] *= upsample_linear(factor, scale, slice(rows.start // scale, rows.stop // scale))
+
+    for_row_blocks(work, len(picture), picture.shape[1], multiple=scale)
+
+
+def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:
+    """Return what two noisy differences (h, w) agree on, level by level (a Laplacian pyramid).
+
+    Their noise is independent, so the mean of their product is the square of what they share.
+    """
+    height, width = low.shape
+    coarser = np.zeros_like(low)
+    if levels > 1 and min(height, width) >= 8:
+        margins = [(0, side % 2) for side in low.shape]
+        half_low, half_high = (box_downsample(np.pad(plane, margins, "edge"), 2) for plane in (low, high))
+        coarser = _enlarge(_agreed(half_low, half_high, share, levels - 1), height, width)
+        low, high = low - _enlarge(half_low, height, width), high - _enlarge(half_high, height, width)
+    mean = high + share * (low - high)
+    most = np.float32(LARGEST)
+    product = np.clip(low * high, -most, most)
+    size = [LIGHT_REACH]
+    common, squares, energy = (means_around(plane, size)[0] for plane in (product, product * product, mean * mean))
+    shrink = _certainty(common, squares, LIGHT_REACH, WINDOWS[-1][1]) * _kept(energy, energy - common)
+    return mean * means_around(shrink, size)[0] + coarser
+
+
+def _enlarge(half: Array, height: int, width: int) -> Array:
+    """Return a plane at twice its resolution, without the row or column that made its size even."""
+    return upsample_linear(half, 2, slice(0, len(half)))[:height, :width]

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure what one render, two renders of one size, and a pair of two sizes give, at equal average samples.
+
+    python -m research.benchmarks.one_size RENDERS --one 32 --two 16:32 --table research/benchmarks/results/one_size.csv
+
+RENDERS are those of :mod:`research.benchmarks.scenes`. "joint-x1" is our model on one render, "joint-x1, two seeds" on
+two of the same size, "joint-x2" on an LRHS of half the size and an HRLS with half of the samples each. "OIDN" and "OIDN
+prefiltered" get the one render, and "OIDN on two seeds" the mean of both, weighted by their spp.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+from oiio_msspl import Render, fuse
+from oiio_msspl.compare import scores
+from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.model.catalogue import QUALITIES, load_model
+from oiio_msspl.model.contract import ONE_SIZE
+from oiio_msspl.model.session import Session
+from research.benchmarks import results, scenes
+from research.benchmarks.accuracy import KEYS, with_means
+from research.benchmarks.peers import oidn, oidn_prefiltered
+from research.benchmarks.results import Row
+
+#: Ending of a method that gets two renders of one size.
+SEEDS = ", two seeds"
+#: Scale of the pair of two sizes.
+PAIR = 2
+
+Sessions = dict[int, list[Session]]
+
+
+def of_one(scene: scenes.Scene, sessions: Sessions, spp: int) -> Iterator[tuple[str, Callable[[], Array]]]:
+    """Yield every method that gets one render or a pair of two sizes, and a function that computes its picture."""
+    render = scene.hrls(spp)
+    yield "render", partial(scenes.beauty, render)
+    yield "OIDN", partial(oidn, render)
+    yield "OIDN prefiltered", partial(oidn_prefiltered, render)
+    for session in sessions[ONE_SIZE]:
+        yield session.name, partial(_fused, render, render, session)
+    for session in sessions[PAIR]:
+        yield session.name, partial(_fused, scene.lrhs(PAIR, spp // 2), scene.hrls(spp // 2), session)
+
+
+def of_two(scene: scenes.Scene, sessions: Sessions, spp: tuple[int, int]) -> Iterator[tuple[str, Callable[[], Array]]]:
+    """Yield every method that gets two renders of one size, and a function that computes its picture."""
+    first, second = (scene.hrls(count) for count in spp)
+    share = spp[0] / sum(spp)
+    low, high = (render.read(render.data_window) for render in (first, second))
+    mean = Render.from_arrays("mean", **{name: share * low[name] + (1 - share) * high[name] for name in high})
+    yield f"render{SEEDS}", partial(scenes.beauty, mean)
+    yield f"OIDN{SEEDS}", partial(oidn, mean)
+    yield f"OIDN prefiltered{SEEDS}", partial(oidn_prefiltered, mean)
+    for session in sessions[ONE_SIZE]:
+        yield f"{session.name}{SEEDS}", partial(_fused, first, second, session, share)
+
+
+def _fused(lr: ReadableRender, hr: ReadableRender, session: Session, share: float | None = None) -> Array:
+    return fuse(lr, hr, session, share=share).rgb
+
+
+def measure(folder: Path, one: Sequence[int], two: Sequence[tuple[int, int]]) -> list[Row]:
+    """Return a row for each scene, average spp and method."""
+    sessions = {scale: [load_model(scale, quality) for quality in QUALITIES] for scale in (ONE_SIZE, PAIR)}
+    rows: list[Row] = []
+    for scene in scenes.load(folder):
+        jobs = [(spp, of_one(scene, sessions, spp)) for spp in one]
+        jobs += [(sum(spp), of_two(scene, sessions, spp)) for spp in two]
+        for spp, methods in jobs:
+            for method, picture in methods:
+                key = {"scene": scene.name, "spp": spp, "method": method, **results.model_of(method)}
+                rows.append(key | scores(picture(), scene.reference))
+    return rows
+
+
+def _two(text: str) -> tuple[int, int]:
+    first, second = map(int, text.split(":"))
+    return first, second
+
+
+def main() -> None:
+    """Measure the scenes of a folder."""
+    parser = results.parser(__doc__)
+    parser.add_argument("folder", type=Path, help="renders")
+    parser.add_argument("--one", type=int, nargs="*", default=[], metavar="SPP", help="of one render, and of a pair")
+    parser.add_argument("--two", type=_two, nargs="*", default=[], metavar="SPP:SPP", help="of two renders of one size")
+    args: argparse.Namespace = parser.parse_args()
+    results.show(with_means(measure(args.folder, args.one, args.two)), args.table, KEYS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One render, which is given as both, and two renders of one size."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl import InputError, Render, fuse, fuse_arrays
+from oiio_msspl.fusion.checks.pair import check_renders
+from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
+from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.image.filters import even_and_odd
+from oiio_msspl.model.catalogue import load_model
+from oiio_msspl.model.encoding import encode_radiance
+from tests.conftest import noisy, picture, spread
+
+HEIGHT, WIDTH = 120, 168
+
+
+def layers(spp=4, seed=0, height=HEIGHT, width=WIDTH):
+    clean = picture(height, width)
+    return {"rgb": noisy(clean, spp, seed), "albedo": clean.clip(0, 1), "normal": np.full_like(clean, 0.5)}
+
+
+def error(image, height=HEIGHT, width=WIDTH):
+    return np.abs(encode_radiance(image, 1.0) - encode_radiance(picture(height, width), 1.0)).mean()
+
+
+@pytest.mark.parametrize("quality", ["fast", "balanced", "best"])
+def test_one_render_loses_its_noise_and_two_lose_more(quality):
+    session = load_model(1, quality, threads=1)
+    first, second = (Render.from_arrays(f"seed {seed}", **layers(seed=seed)) for seed in (1, 2))
+    one, both = fuse(second, second, session), fuse(first, second, session)
+    assert one.rgb.shape == both.rgb.shape == (HEIGHT, WIDTH, 3)
+    assert error(both.rgb) < error(one.rgb) < 0.3 * error(second.layers["rgb"])
+    assert one.warnings == both.warnings == []
+
+
+def test_tiles_of_one_render_do_not_show(monkeypatch):
+    from oiio_msspl.fusion.tiles import tiling
+
+    session = load_model(1, "fast", threads=1)
+    render = Render.from_arrays("hr", **layers(height=64, width=400))
+    whole = fuse(render, render, session)
+    monkeypatch.setattr(tiling, "TILE_MEMORY", 64 * 300 * session.contract.bytes_per_pixel)
+    tiled = fuse(render, render, session)
+    assert tiled.tiles > whole.tiles == 1
+    difference = np.abs(encode_radiance(tiled.rgb, 1.0) - encode_radiance(whole.rgb, 1.0))
+    assert difference.max() < 0.02
+
+
+def test_the_share_of_two_renders_is_found_or_given():
+    """A render with 64 times the samples of the other one decides the result."""
+    session = load_model(1, "fast", threads=1)
+    few, many = (Render.from_arrays(f"{spp} spp", **layers(spp=spp, seed=spp)) for spp in (1, 64))
+    found, by_spp, equal = (fuse(few, many, session, share=share).rgb for share in (None, 1 / 65, 0.5))
+    assert error(found) < 0.7 * error(equal)
+    assert error(by_spp) < 0.7 * error(equal)
+
+
+def test_two_renders_of_one_seed_are_refused():
+    first, second = (Render.from_arrays(name, **layers(seed=1)) for name in ("a.exr", "b.exr"))
+    message = r"a\.exr and b\.exr have the same noise; render each with a noise seed of its own"
+    with pytest.raises(InputError, match=message):
+        fuse(first, second, load_model(1, "fast", threads=1))
+    with pytest.raises(InputError, match=message):
+        check_renders(first, second)
+
+
+def test_two_renders_without_noise_are_no_mistake():
+    clean = picture(HEIGHT, WIDTH)
+    first, second = (Render.from_arrays(name, rgb=clean) for name in ("a", "b"))
+    np.testing.assert_array_equal(fuse(first, second, load_model(1, "fast", threads=1)).rgb, clean)
+
+
+def test_renders_of_other_frames_are_doubted():
+    first, second = (Render.from_arrays(f"seed {seed}", **layers(spp=16, seed=seed)) for seed in (1, 2))
+    assert check_renders(first, second) == []
+    shifted = Render.from_arrays("b", rgb=np.roll(second.layers["rgb"], 9, axis=1))
+    (warning,) = check_renders(first, shifted)
+    assert "shifted" in warning and "LRHS" not in warning
+
+
+@pytest.mark.parametrize("sigma", [0, 0.5])
+def test_one_render_tells_whether_its_noise_is_spread(sigma):
+    rgb = layers()["rgb"]
+    render = Render.from_arrays("hr", rgb=spread(rgb, sigma) if sigma else rgb)
+    assert is_noise_spread(render, render, align(render, render)) == bool(sigma)
+
+
+def test_even_and_odd_pixels_are_two_pictures():
+    plane = np.random.default_rng(0).normal(size=(31, 40)).astype(np.float32)
+    even, odd = even_and_odd(plane)
+    assert even[0, 0] == plane[0, 0] and odd[0, 1] == plane[0, 1]
+    assert even[1, 2] == pytest.approx(plane[[0, 2, 1, 1], [2, 2, 1, 3]].mean(), abs=1e-6)
+    assert abs(np.corrcoef(even.ravel(), odd.ravel())[0, 1]) < 0.1
+
+
+@pytest.mark.parametrize("sigma", [0, 0.5])
+def test_arrays_choose_their_model(sigma, monkeypatch):
+    """By sizes, layers and noise; and the frame is that of the model."""
+    from oiio_msspl.jobs import arrays
+
+    chosen = []
+    monkeypatch.setattr(
+        arrays, "_session", lambda *given: chosen.append(given[:2]) or load_model(*given[:2], threads=1)
+    )
+    images = layers()
+    images["rgb"] = spread(images["rgb"], sigma) if sigma else images["rgb"]
+    second = noisy(picture(HEIGHT, WIDTH), 4, seed=5)
+    second = spread(second, sigma) if sigma else second
+    aovs = {name: images[name] for name in ("albedo", "normal")}
+    fused = fuse_arrays(images["rgb"], **aovs, quality="best")
+    assert error(fused.rgb) < 0.4 * error(images["rgb"])
+    fuse_arrays(images["rgb"], second, quality="best")
+    fuse_arrays(hr=images["rgb"], lr=second[::2, ::2], **aovs, quality="fast")
+    end = "-spread" if sigma else ""
+    assert chosen[:2] == [(1, f"joint-large{end}"), (1, f"joint{end}")]
+    assert chosen[2][0] == 2
+    with pytest.raises(InputError, match="use one of fast, balanced, best"):
+        fuse_arrays(images["rgb"], quality="good")

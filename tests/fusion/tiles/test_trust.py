@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What both renders show comes back, and noise does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.filters import box_downsample
+
+SIZE, REACH = 256, 48
+
+
+def wall() -> Array:
+    """Return a smooth picture, (SIZE, SIZE, 3)."""
+    y, x = np.mgrid[:SIZE, :SIZE].astype(np.float32)
+    light = 0.4 + 0.2 * np.cos(x / 50) * np.cos(y / 60)
+    return light[..., None] * np.array([0.8, 0.6, 0.5], np.float32)
+
+
+def rendered(truth: Array, spp: int, seed: int) -> Array:
+    """Return a render whose samples have an exponential distribution."""
+    noise = np.random.default_rng(seed).gamma(spp, 1 / spp, truth.shape[:2]).astype(np.float32)
+    return truth * noise[..., None]
+
+
+def pair(truth: Array, spp: tuple[int, int], scale: int = 2) -> Renders:
+    """Return an LRHS and an HRLS with (LRHS, HRLS) samples a pixel."""
+    low, high = spp
+    # A sample of the LRHS lies anywhere in its pixel.
+    lrhs = box_downsample(rendered(truth, max(low // scale**2, 1), 1), scale)
+    return Renders(lrhs, rendered(truth, high, 2), low / (low + high * scale**2), 1.0)
+
+
+def rms(image: Array, truth: Array) -> float:
+    """Return the root mean square error relative to the truth."""
+    return float(np.sqrt(np.mean(np.square((image - truth) / (truth + 0.01)))))
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+@pytest.mark.parametrize("hrls_spp", [1, 16])
+def test_noise_is_not_put_back(scale: int, hrls_spp: int) -> None:
+    truth = wall()
+    renders = pair(truth, (hrls_spp * scale**2, hrls_spp), scale)
+    result, trust = trust_renders(truth, renders, {2: 48, 4: 32, 8: 16}[scale])
+    assert rms(renders.hrls, truth) > 0.2
+    assert rms(result, truth) < 0.005
+    assert trust.mean() < 0.002
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+def test_detail_that_both_renders_show_comes_back(scale: int) -> None:
+    y, x = np.mgrid[:SIZE, :SIZE]
+    truth = wall() * (1 + 0.3 * np.where((x // 2 + y // 3) % 2, 1, -1))[..., None].astype(np.float32)
+    renders = pair(truth, (64 * scale**2, 64), scale)
+    result, trust = trust_renders(wall(), renders, REACH)
+    assert rms(wall(), truth) > 0.25
+    assert rms(result, truth) < rms(renders.hrls, truth)
+    assert trust.mean() > 0.8
+
+
+def test_two_renders_of_one_size_tell_their_noise() -> None:
+    y, x = np.mgrid[:SIZE, :SIZE]
+    truth = wall() * (1 + 0.3 * np.where((x // 2 + y // 3) % 2, 1, -1))[..., None].astype(np.float32)
+    first, second = (rendered(truth, 64, seed) for seed in (1, 2))
+    result, _ = trust_renders(wall(), Renders(first, second, 0.5, 1.0), REACH)
+    assert rms(result, truth) < 1.05 * rms((first + second) / 2, truth)
+    noise, _ = trust_renders(truth, Renders(first, second, 0.5, 1.0), REACH)
+    assert rms(noise, truth) < 0.005
+
+
+def test_a_firefly_of_one_render_does_not_come_back() -> None:
+    truth = wall()
+    for seed in range(5):
+        renders = pair(truth, (16, 4))
+        y, x = np.random.default_rng(seed).integers(40, SIZE - 40, 2)
+        renders.hrls[y, x] = 200
+        result, _ = trust_renders(truth, renders, REACH)
+        assert result[y, x].max() < 2
+
+
+def test_stars_come_back() -> None:
+    rng = np.random.default_rng(3)
+    truth = np.full((SIZE, SIZE, 3), 0.002, np.float32)
+    y, x = rng.integers(0, SIZE, (2, 600))
+    truth[y, x] = rng.exponential(1, (600, 1)) + 0.2
+    fused = np.full_like(truth, truth.mean() / 3)
+    noisy = truth.copy()
+    noisy[y, x] *= rng.normal(1, 0.1, (600, 1))
+    result, _ = trust_renders(fused, Renders(box_downsample(truth, 2), noisy, 0.5, 5.0), REACH)
+    assert result[y, x].mean() == pytest.approx(truth[y, x].mean(), rel=0.1)
+
+
+def test_a_lamp_alone_comes_back() -> None:
+    truth = wall()
+    truth[100:102, 60:62] = 60
+    renders = pair(wall(), (256, 64))
+    renders.hrls[100:102, 60:62] = 60
+    renders.lrhs[50, 30] = 60
+    fused = wall()
+    fused[100:102, 60:62] = 5
+    result, _ = trust_renders(fused, renders, REACH)
+    assert result[100:102, 60:62].mean() == pytest.approx(60, rel=0.05)
+    assert rms(result[110:], wall()[110:]) < 0.01
+    around = result[90:112, 50:72] / wall()[90:112, 50:72]
+    assert np.median(around) == pytest.approx(1, abs=0.02)
+
+
+def test_light_that_the_network_has_lost_comes_back() -> None:
+    truth = wall()
+    renders = pair(truth, (256, 16))
+    result, _ = trust_renders(truth * np.array([1, 1.03, 0.85], np.float32), renders, REACH)
+    ratio = result.mean(axis=(0, 1)) / truth.mean(axis=(0, 1))
+    assert ratio == pytest.approx(1, abs=0.01)
+
+
+def test_a_wider_filter_of_the_lrhs_is_no_light() -> None:
+    # An LRHS pixel with a wide filter sees what lies around it. The HRLS does not agree, so edges stay.
+    y, x = np.mgrid[:SIZE, :SIZE]
+    truth = wall() * np.where((x // 16 + y // 16) % 2, 1.0, 0.1)[..., None].astype(np.float32)
+    low = box_downsample(truth, 4)
+    padded = np.pad(low, ((1, 1), (1, 1), (0, 0)), "edge")
+    blurred = sum(padded[i : i + len(low), j : j + len(low)] for i in range(3) for j in range(3)) / 9
+    result, _ = trust_renders(truth, Renders(blurred.astype(np.float32), rendered(truth, 4, 1), 0.9, 1.0), 32)
+    assert rms(result, truth) < 0.02
+
+
+def test_black_renders_stay_black() -> None:
+    black = np.zeros((64, 64, 3), np.float32)
+    result, trust = trust_renders(black, Renders(black[::2, ::2], black, 0.5, 1.0), REACH)
+    assert not result.any() and not trust.any()

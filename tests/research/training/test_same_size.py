@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The models of renders of one size, which are made out of those for pairs at x2."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+import onnx
+
+from oiio_msspl.model.catalogue import QUALITIES, WEIGHTS
+from oiio_msspl.model.contract import ONE_SIZE, SPREAD, Contract
+from oiio_msspl.model.devices import gpu_file
+from oiio_msspl.model.session import Session
+from research.training.same_size import same_size_model
+
+FAMILIES = [family + noise for family in QUALITIES.values() for noise in ("", SPREAD)]
+
+
+@pytest.mark.parametrize("family", [QUALITIES["fast"] + SPREAD, QUALITIES["best"]])
+def test_the_files_are_those_that_are_made_from_the_model_for_pairs(family):
+    first_stage = family == QUALITIES["best"]
+    for path in (WEIGHTS / f"{family}-x2.onnx", gpu_file(WEIGHTS / f"{family}-x2.onnx")):
+        shipped = onnx.load(path.with_name(f"{family}-x1.onnx"), load_external_data=False)
+        made = same_size_model(path, first_stage=first_stage)
+        assert shipped.SerializeToString(deterministic=True) == made.SerializeToString(deterministic=True)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_two_renders_are_denoised_together(family):
+    """Their mean, and better than one of them, which is given as both with shares of 0."""
+    rng = np.random.default_rng(0)
+    clean = np.linspace(0.1, 0.9, 96)[:, None, None] * np.linspace(0.2, 1, 160)[None, :, None] * np.ones(3)
+    aov = np.full(clean.shape, 0.5, np.float32)
+    first, second = (
+        {"rgb": (clean * rng.gamma(4, 1 / 4, clean.shape)).astype(np.float32), "albedo": aov, "normal": aov}
+        for _ in range(2)
+    )
+    path = WEIGHTS / f"{family}-x1.onnx"
+    assert Contract.of_file(path).scale == ONE_SIZE
+    session = Session(path, threads=1)
+    both = session.run(first, second, 1.0, dict.fromkeys(("rgb", "albedo", "normal"), 0.5))["fused"]
+    one = session.run(second, second, 1.0, {})["fused"]
+    noise, error, error_of_one = (np.abs(image - clean).mean() for image in (second["rgb"], both, one))
+    assert error < error_of_one < 0.3 * noise

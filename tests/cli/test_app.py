@@ -42,13 +42,13 @@ SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --quality --device --max-memory --output --layout --layers --passes --error-layer "
         "--overwrite --json --frames --temporal --skip-existing --help --help-all --version",
-        21,
+        23,
     ),
     "msspl_render": (
         "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output "
         "--layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
         "--help --help-all --version",
-        9,
+        11,
     ),
 }
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from oiio_msspl.jobs.arrays import fuse_arrays
     from oiio_msspl.jobs.files import fuse_files
     from oiio_msspl.jobs.inputs import InputOptions
+    from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.report import FrameReport
     from oiio_msspl.jobs.shot import fuse_shot
     from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
@@ -51,6 +52,7 @@ _MODULES = {
     "Render": "exr.render",
     "Session": "model.session",
     "ShotReport": "jobs.shot_report",
+    "TemporalOptions": "jobs.plan",
     "Window": "exr.render",
     "WriteOptions": "exr.write_options",
     "find_model": "model.catalogue",
@@ -75,6 +77,7 @@ __all__ = [
     "Render",
     "Session",
     "ShotReport",
+    "TemporalOptions",
     "Window",
     "WriteOptions",
     "__version__",

@@ -20,6 +20,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import os
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -298,13 +299,20 @@ def _write_codes(out: TextIO, name: str, codes: Codes) -> dict[str, Any]:
     return {"id": name, "width": width, "height": height, "channels": channels, "differences": smooth}
 
 
+def _names_of(paths: Sequence[Path]) -> list[str]:
+    """Return the names of files, below their common folder where two have one name: nobody else's page tells a path."""
+    names = [path.name for path in paths]
+    common = os.path.commonpath([path.absolute().parent for path in paths])
+    below = [path.absolute().relative_to(common).as_posix() for path in paths]
+    return [name if names.count(name) == 1 else longer for name, longer in zip(names, below, strict=True)]
+
+
 def _manifest(
     pictures: Sequence[_Picture], largest: _Picture, has_reference: bool, layers: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
     """Describe the pictures and layers for the page's script."""
     colours = error_colours(np.linspace(0, 1, ERROR_LEVELS, dtype=np.float32)[None])[0]
     paths = [picture.render.file.path for picture in pictures]
-    names = [path.name for path in paths]
     return {
         "height": largest.window.height,
         "width": largest.window.width,
@@ -312,7 +320,7 @@ def _manifest(
         "codesPerStop": CODES_PER_STOP,
         "stopsBelowOne": STOPS_BELOW_ONE,
         "errorColours": np.round(colours * 255).astype(int).tolist(),
-        "pictures": [path.name if names.count(path.name) == 1 else str(path) for path in paths],
+        "pictures": _names_of(paths),
         "reference": len(pictures) - 1 if has_reference else None,
         "layers": list(layers),
     }

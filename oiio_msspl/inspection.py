@@ -17,6 +17,7 @@ from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD, MappedRender
 from oiio_msspl.aovs.motion import user_fields
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.motion.source import MotionSource, find_motion
@@ -70,6 +71,23 @@ class Inspection:
         assert render is not None and self.contract is not None
         return render.table(self.contract.hrls)
 
+    @property
+    def layers(self) -> list[dict[str, str]]:
+        """All layers of the file: rows with ``layer``, ``view``, ``channels``, ``type`` and ``part``."""
+        rows = []
+        for layer in layers_of(self.file, deep=True) if self.file is not None else ():
+            channels = list(layer.channels.values())
+            assert self.file is not None
+            parts = dict.fromkeys(self.file.parts[channel.part] for channel in channels)
+            rows.append({
+                "layer": layer.name or "(unnamed)",
+                "view": layer.view,
+                "channels": " ".join(layer.channels),
+                "type": "/".join(sorted({channel.type for channel in channels})),
+                "part": ", ".join((part.name or "unnamed") + " (deep)" * part.deep for part in parts),
+            })  # fmt: skip
+        return rows
+
     def as_dict(self) -> dict[str, Any]:
         """Return the inspection as JSON values."""
         result: dict[str, Any] = {"file": str(self.path), "usable": not self.problems}
@@ -78,6 +96,7 @@ class Inspection:
             result |= {
                 "display_window": str(self.file.display_window),
                 "pixel_aspect": self.file.pixel_aspect,
+                "layers": self.layers,
                 "parts": [
                     {
                         "name": part.name,
@@ -194,6 +213,8 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
         if render.motion.fields:
             layers = " and ".join(f"{vectors.name} ({vectors.format})" for vectors in render.motion.fields)
             result.facts.append(f"motion: {layers} expected; the next frame beside this one would verify it")
+        elif guesses := ", ".join(field.name for field in render.motion.guesses):
+            result.facts.append(f"motion: {guesses} may hold vectors; the next frame beside this one would tell")
         return
     if motion_format:
         user_fields(render.motion, motion_format, render.name)
@@ -221,6 +242,11 @@ def _facts(file: ExrFile) -> list[str]:
     """Describe the windows, and the types and storage of the parts; parts that are alike share a line."""
     aspect = "" if file.pixel_aspect == 1 else f", pixel aspect {file.pixel_aspect:g}"
     facts = [f"display window {file.display_window}{aspect}"]
+    if made := {key.removeprefix("msspl/"): value for key, value in file.metadata.items() if key.startswith("msspl/")}:
+        renders = " and ".join(str(made[name]) for name in ("lrhs", "hrls") if name in made)
+        facts.append(
+            f"a result, fused with {made.get('model', 'an unknown model')} from {renders or 'unknown renders'}"
+        )
     alike: dict[str, list[str]] = {}
     for part in file.parts:
         kind = "deep" if part.deep else f"tiled {part.tile[0]}x{part.tile[1]}" if part.tile != (0, 0) else "scan lines"

@@ -306,3 +306,14 @@ def test_names_out_of_files_are_texts(tmp_path):
     html = dump_dom((tmp_path / "page.html").as_uri())
     assert "<h1>" not in html.split('id="manifest"')[0]
     assert "&lt;/script&gt;&lt;h1&gt;light_1</option>" in html
+
+
+def test_the_page_tells_no_paths(tmp_path):
+    """Of files with one name, the folders tell them apart."""
+    for folder in ("secret/one", "secret/two"):
+        (tmp_path / folder).mkdir(parents=True)
+        write_exr(tmp_path / folder / "out.exr", rgb(picture(16, 16)))
+    paths = [tmp_path / "secret" / name / "out.exr" for name in ("one", "two")]
+    write_page(tmp_path / "page.html", open_comparison(paths, None, None))
+    text = (tmp_path / "page.html").read_text()
+    assert '"one/out.exr", "two/out.exr"' in text and "secret" not in text

@@ -7,20 +7,17 @@
 from __future__ import annotations
 
 import logging
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from oiio_msspl import __version__
 from oiio_msspl.errors import InputError, printable
 
 if TYPE_CHECKING:
     from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.jobs.inputs import InputOptions
-
-#: Bytes above which a size is a slip. Larger numbers are infinite as floats.
-LARGEST_MEMORY = 1 << 62
 
 #: Groups of options in the help text.
 INPUT, MODEL, OUTPUT, SHOT = "Input", "Model", "Output", "Shot"
@@ -39,6 +36,13 @@ def _show_all(context: typer.Context, wanted: bool) -> None:
         for parameter in context.command.params:
             parameter.hidden = False  # type: ignore[attr-defined]
         typer.echo(context.get_help())
+        raise typer.Exit
+
+
+def _show_version(wanted: bool) -> None:
+    """Print the version, and exit."""
+    if wanted:
+        typer.echo(__version__)
         raise typer.Exit
 
 
@@ -114,6 +118,9 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.",
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.", hidden=True)]
 HelpAll = Annotated[
     bool, typer.Option("--help-all", help="Show all options and exit.", is_eager=True, callback=_show_all)
+]
+Version = Annotated[
+    bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_show_version)
 ]
 
 
@@ -222,18 +229,3 @@ def make_write_options(
         trust_layer=trust_layer,
         data_passes=data_passes,
     )
-
-
-def parse_bytes(text: str) -> int:
-    """Return the number of bytes that ``3G``, ``800M`` or a plain number means.
-
-    Raises:
-        InputError: the text can't be read, or no machine has so much memory.
-    """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", text.strip(), re.IGNORECASE)
-    if not match:
-        raise InputError(f"--max-memory {text!r}: write it as 3G or 800M")
-    number = float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " ")
-    if number > LARGEST_MEMORY:
-        raise InputError("--max-memory: the number is too large; write it as 3G or 800M")
-    return int(number)

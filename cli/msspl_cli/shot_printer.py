@@ -36,6 +36,21 @@ class ShotPrinter:
         self._report: ShotReport | None = None
         self._printed: set[str] = set()
 
+    def begin(self, report: ShotReport) -> None:
+        """Print what was found and what will be done, before the first frame is fused."""
+        if self._as_json or self._quiet or self._progress == "json":
+            return
+        if found := report.found:
+            views = console.views_in_words(found["views"])
+            pairs = "Pairs" if found["renderer"] == "unknown" else f"{found['renderer']} pairs"
+            pairs += f" at x{found['scale']}, {found['model']}"
+            console.say(f"{pairs}{views}; layers of frame {found['frame']}:")
+            console.aov_table(found["aovs"], found["notes"])
+            for name, layers in found["sets"].items():
+                console.say(f"  {name}: fused if they sum to the beauty: {layers}")
+        if report.temporal:
+            console.say(f"Fuses {report.temporal}")
+
     def __call__(self, result: FrameResult, report: ShotReport) -> None:
         """Print the progress, the errors and the warnings of a frame that ended."""
         self._report = report
@@ -91,19 +106,11 @@ def _print_json(result: FrameResult, report: ShotReport) -> None:
 
 
 def _print_table(report: ShotReport) -> None:
-    """Print which layers were read, and which frames ended in which way and why."""
-    from oiio_msspl.aovs.views import name_of
+    """Print what became of passes, and which frames ended in which way and why."""
     from oiio_msspl.jobs.sequence import format_frames
 
-    if first := report.first:
-        views = console.views_in_words([name_of(entry["view"]) for entry in first.get("fused_views", ())])
-        pairs = f"{first['renderer']} pairs at x{first['scale']}, {first['model']}"
-        console.say(f"{pairs}{views}; layers of frame {first['frame']}:")
-        console.aov_table(first["aovs"], first["notes"])
-        for name, outcome in first["passes"].items():
-            console.say(f"  {name}: {outcome}")
-    if report.temporal and any(result.status == "fused" for result in report.results.values()):
-        console.say(f"Fused {report.temporal}")
+    for name, outcome in (report.first or {}).get("passes", {}).items():
+        console.say(f"{name}: {outcome}")
     # Sentences that differ only in their numbers share a row, which shows the first of them.
     groups: dict[tuple[str, str], tuple[list[int], str]] = {}
     for frame in report.shot.frames:

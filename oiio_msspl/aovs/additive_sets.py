@@ -8,17 +8,18 @@ measured by :mod:`oiio_msspl.fusion.passes.sums`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import partial
 from typing import Any
 
 from oiio_msspl.aovs.formula import FeatureFormula
-from oiio_msspl.aovs.renderers import entry_of, renderers, view_layer_of
+from oiio_msspl.aovs.renderers import entry_of, names_of_aov, renderers, view_layer_of
 from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, matches_layer
-from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.reader import Channel, ExrFile
 
 #: The words of a layer's name, also where a renderer writes them together (``directdiffuse``).
 _WORD = re.compile(r"indirect|direct|combined|rgba|(?:(?!indirect|direct|combined|rgba)[^ _.-])+")
@@ -79,7 +80,11 @@ class AdditiveSet:
 
 
 def find_additive_sets(
-    renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, sums: Sequence[str] = (), path: str = ""
+    renderer: Mapping[str, Any],
+    layers: Sequence[Layer],
+    beauty: Beauty,
+    sums: Sequence[str] = (),
+    file: ExrFile | None = None,
 ) -> list[AdditiveSet]:
     """Find the candidates of a file: those of the user, of its renderer, and then of names that any program may use.
 
@@ -87,15 +92,16 @@ def find_additive_sets(
 
     Args:
         renderer: entry of the table.
-        layers, path: of the file.
+        layers: of the file.
         beauty: the one that the sets should sum to; its view and view layer are searched.
         sums: the user's, as ``NAME=a+b+c*d``.
+        file: the file, whose header may name layers; None for layers without a file.
 
     Raises:
         InputError: a sum of the user can't be read, names a layer that is not there, or has the name of another.
     """
-    finder = _Finder(layers, beauty)
-    sets = [_user_set(finder, text, path) for text in sums]
+    finder = _Finder(layers, beauty, partial(names_of_aov, renderer, file) if file else lambda alias: [alias])
+    sets = [_user_set(finder, text, str(file.path) if file else "") for text in sums]
     names = [additive.name for additive in sets]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"--sum: two sets are called {twice[0]!r}; give each a name of its own")
@@ -121,8 +127,8 @@ def find_additive_sets(
 class _Finder:
     """Finder of the layers of one view and view layer that hold light."""
 
-    def __init__(self, layers: Sequence[Layer], beauty: Beauty) -> None:
-        self._beauty = beauty
+    def __init__(self, layers: Sequence[Layer], beauty: Beauty, names_of: Callable[[str], list[str]]) -> None:
+        self._beauty, self._names_of = beauty, names_of
         named = beauty.layers_of_view(layers)
         self._layers = [(n, layer) for n, layer in named if layer.triple() and layer is not beauty.layer]
 
@@ -146,13 +152,16 @@ class _Finder:
 
     def _named(self, alias: str) -> Iterator[tuple[str, Layer]]:
         """Yield the layers of a name, or of a pattern with ``*``, where ``_`` matters: ``C_*`` is not ``coat``."""
-        for name, layer in self._layers:
-            if "*" in alias:
-                is_named = fnmatchcase(name.lower(), alias.lower())
-            else:
-                is_named = view_layer_of(layer.name, alias) in (self._beauty.view_layer, "")
-            if is_named:
-                yield name, layer
+        if "*" in alias:
+            yield from (pair for pair in self._layers if fnmatchcase(pair[0].lower(), alias.lower()))
+            return
+        places = (self._beauty.view_layer, "")
+        for name in self._names_of(alias):
+            found = [pair for pair in self._layers if view_layer_of(pair[1].name, name) in places]
+            if found:
+                exact = [pair for pair in found if pair[1].name.endswith(name)]
+                yield from exact or found
+                return
 
 
 def _user_set(finder: _Finder, text: str, path: str) -> AdditiveSet:

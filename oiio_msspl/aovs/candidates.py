@@ -17,10 +17,13 @@ from oiio_msspl.aovs.features import RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.renderers import (
+    best_spelled,
+    candidates_of,
     detect_renderer,
     entry_of,
+    file_beside,
     file_names,
-    layer_of_source,
+    names_of_aov,
     sibling_of,
     siblings_of,
     view_layer_of,
@@ -99,7 +102,7 @@ class LayerFinder:
         renderer = detect_renderer(file, layers)
         place = self._view, self._view_layer
         formulas: dict[tuple[Channel, ...], FeatureFormula] = {}
-        for candidate in renderer.get(feature, []):
+        for candidate in candidates_of(renderer, feature):
             for view, view_layer in _views_and_view_layers(layers, place):
                 formula = LayerFinder(file, layers, renderer, view, view_layer).formula(feature, candidate, [])
                 if formula is not None:
@@ -124,12 +127,26 @@ class LayerFinder:
         """Return the layer that an alias names: of the chosen view layer, or else of none."""
         if alias.startswith("file:"):
             return self._layer_of_file(feature, alias.removeprefix("file:"))
-        names = [alias, layer_of_source(self._renderer, self._file, alias)]
-        for name, view_layer in itertools.product(filter(None, names), (self._view_layer, "")):
-            for layer in self._layers:
-                if view_layer_of(layer.name, name) == view_layer:
-                    return layer
+        if alias.startswith("beside:"):
+            return self._layer_beside(alias.removeprefix("beside:"))
+        names = names_of_aov(self._renderer, self._file, alias)
+        for name, view_layer in itertools.product(names, (self._view_layer, "")):
+            named = (layer for layer in self._layers if view_layer_of(layer.name, name) == view_layer)
+            if layer := best_spelled(named, name):
+                return layer
         return None
+
+    def _layer_beside(self, aov: str) -> Layer | None:
+        """Return the only layer of a file beside the beauty, if it shows the same frame."""
+        path = file_beside(self._file.path, aov)
+        if path is None or self._view_layer:
+            return None
+        try:
+            file = self._open(path)
+        except InputError:  # nobody has named this file
+            return None
+        layers = [layer for layer in layers_of(file) if layer.triple() and layer.view in (self._view, "")]
+        return replace(layers[0], name=path.name) if len(layers) == 1 else None
 
     def _layer_of_file(self, feature: str, name: str) -> Layer | None:
         """Return a layer of another EXR, which ``name`` gives as FILE.exr:LAYER, FILE.exr, or AOV of a sibling file."""
@@ -176,7 +193,7 @@ def _aliases(entry: Mapping[str, Any]) -> list[str | list[str]]:
 def _only_layer(path: Path, layers: list[Layer], feature: str, renderer: dict[str, Any]) -> Layer:
     """Return the only layer of a file that could be the feature and is not named as a beauty."""
     fitting = [layer for layer in layers if layer.triple() or (feature == VARIANCE and layer.scalar())]
-    beauties = filter(None, renderer[RGB])
+    beauties = filter(None, candidates_of(renderer, RGB))
     if len(fitting) == 1 and all(view_layer_of(fitting[0].name, beauty) is None for beauty in beauties):
         return fitting[0]
     texts = [layer.name or "R G B" for layer in fitting]
@@ -211,7 +228,8 @@ def missing(feature: str, candidate: Any, file: ExrFile) -> str:
         return f"{feature} is mapped to {text}, which is deep; flatten it first"
     if any(channel.name == text for part in file.parts for channel in part.channels):
         return f"{feature} is mapped to {text}, which is a channel, not a layer; msspl inspect names the layers"
-    return f"{feature} is mapped to {text}, which is not there"
+    there = ", ".join(layer.name for layer in layers_of(file) if layer.name and layer.triple())
+    return f"{feature} is mapped to {text}, which is not there" + (f" (layers: {there})" if there else "")
 
 
 def wrong_channels(feature: str, layer: Layer) -> str:

@@ -207,5 +207,5 @@ def origin(row: Mapping[str, str]) -> str:
         hint = "none: expect blur, render an albedo (or name it with --map albedo=LAYER)"
         return hint if row["feature"] == ALBEDO else "none (optional)"
     if status == "unused":
-        return f"found: {source}; this model does not read it"
+        return f"not read: {source}"
     return "none" if status == "absent" else f"{status}: {source}"

@@ -39,10 +39,11 @@ def read_map_file(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     try:
         if not path.is_file():  # devices such as /dev/zero never end
-            raise InputError(f"{path}: no such file")
+            problem = "is a folder" if path.is_dir() else "is no ordinary file" if path.exists() else "no such file"
+            raise InputError(f"{path}: {problem}; name a TOML file with a line for each feature")
         if path.stat().st_size > LARGEST_MAP_FILE:
             raise InputError(f"{path}: is too large for a mapping; name a TOML file with a line for each feature")
-        mapping = tomllib.loads(path.read_text(encoding="utf-8"))
+        mapping = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:  # text that is not UTF-8, a mistake in the TOML, a number of 5,000 digits
         raise InputError(f"{path}: can't be read as a mapping ({error})") from error
     except RecursionError as error:

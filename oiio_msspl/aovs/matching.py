@@ -20,8 +20,16 @@ from oiio_msspl.aovs.formula import NEEDS_SPP, FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import check_mapping
 from oiio_msspl.aovs.motion import find_motion_layers
-from oiio_msspl.aovs.renderers import detect_renderer, entry_of, samples_per_pixel, view_layer_of
-from oiio_msspl.aovs.views import Beauty, choose_beauty, find_beauties
+from oiio_msspl.aovs.renderers import (
+    candidates_of,
+    detect_renderer,
+    entry_of,
+    known_as_other,
+    names_of_aov,
+    samples_per_pixel,
+    view_layer_of,
+)
+from oiio_msspl.aovs.views import Beauty, choose_beauty, find_alpha, find_beauties, only_colour
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import ExrFile
@@ -64,7 +72,9 @@ def map_render(
     renderer = detect_renderer(file, layers)
     if RGB not in mapping:
         _check_holds_beauty(renderer, file)
-    beauties = find_beauties(file, layers, [mapping[RGB]] if RGB in mapping else renderer["rgb"])
+    beauties = find_beauties(file, layers, [mapping[RGB]] if RGB in mapping else _beauty_candidates(renderer, file))
+    if not beauties and RGB not in mapping:
+        beauties = find_beauties(file, layers, only_colour(layers, known_as_other(renderer)))
     if not beauties:
         raise _no_beauty(file, layers, mapping.get(RGB))
     beauty = choose_beauty(file, beauties, view)
@@ -75,11 +85,12 @@ def map_render(
         if feature in mapping:
             formulas[feature] = _user_formula(finder, feature, mapping[feature], file)
             continue
-        candidates = (finder.formula(feature, candidate, notes) for candidate in renderer.get(feature, ()))
-        if (formula := next(filter(None, candidates), None)) is not None:
+        candidates = (finder.formula(feature, candidate, notes) for candidate in candidates_of(renderer, feature))
+        usable = (found for found in candidates if found and not _holds_integers(feature, found, notes))
+        if (formula := next(usable, None)) is not None:
             formulas[feature] = formula
     _check_no_integers(formulas)
-    alpha = beauty.layer.channels.get("A")
+    alpha = find_alpha(layers, beauty)
     if alpha is not None and alpha.type == "uint":
         notes.append(f"alpha: {alpha.name} holds integers; the render counts as one without alpha")
         alpha = None
@@ -93,14 +104,35 @@ def map_render(
         alpha=alpha,
         spp=spp if spp is not None else samples_per_pixel(renderer, file, beauty.view_layer),
         data_window=file.parts[formulas[RGB].terms[0][0].part].data_window,
-        additive_sets=find_additive_sets(renderer, layers, beauty, sums, str(file.path)),
-        motion=find_motion_layers(renderer, layers, beauty),
-        notes=notes,
+        additive_sets=find_additive_sets(renderer, layers, beauty, sums, file),
+        motion=find_motion_layers(renderer, layers, beauty, [c for f in formulas.values() for c in f.channels]),
+        notes=list(dict.fromkeys(notes)),
         mapped=frozenset(mapping),
     )
     _drop_unusable_variance(render)
     _decide_normal_encoding(render)
+    render.notes += _small_windows(render)
     return render
+
+
+def _beauty_candidates(renderer: Mapping[str, Any], file: ExrFile) -> list[Any]:
+    """Return the candidates of the beauty; a layer that the header names comes first."""
+    named = [name for name in names_of_aov(renderer, file, RGB) if name != RGB]
+    return [*named, *candidates_of(renderer, RGB)]
+
+
+def _small_windows(render: MappedRender) -> list[str]:
+    """Return a note on each feature whose part does not cover the beauty's data window."""
+    notes, whole = [], render.data_window
+    alpha = {"alpha": [render.alpha]} if render.alpha else {}
+    for name, channels in ({key: formula.channels for key, formula in render.features.items()} | alpha).items():
+        owners = [render.file.siblings.get(channel.path, render.file).parts[channel.part] for channel in channels]
+        if small := next((part for part in owners if whole.intersect(part.data_window) != whole), None):
+            window = small.data_window
+            notes.append(
+                f"{name}: its part '{small.name}' covers only {window} of {whole}, so it counts as 0 elsewhere"
+            )
+    return notes
 
 
 def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:
@@ -140,6 +172,14 @@ def _user_formula(finder: LayerFinder, feature: str, candidate: Any, file: ExrFi
     if formula is None:
         raise InputError(f"{file.path}: {problems[0] if problems else missing(feature, candidate, file)}")
     return formula
+
+
+def _holds_integers(feature: str, formula: FeatureFormula, notes: list[str]) -> bool:
+    """Return whether a layer that is found by its name can't be the feature, and note it."""
+    integers = [channel for channel in formula.channels if channel.type == "uint"]
+    if integers:
+        notes.append(f"{feature}: {formula.text} holds integers (ids, not light), so it is not read")
+    return bool(integers)
 
 
 def _check_no_integers(formulas: dict[str, FeatureFormula]) -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from oiio_msspl.aovs.renderers import renderers, view_layer_of
+from oiio_msspl.aovs.renderers import known_as_other, renderers, view_layer_of
 from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, same_spelling
@@ -29,6 +29,8 @@ CHOICES = {
 }
 #: Channels of a vector, where the entry of the table does not name them.
 _PAIRS = (("R", "G"), ("X", "Y"), ("u", "v"), ("U", "V"))
+#: The most layers of unknown names that the pixels are asked about: each takes a second.
+MOST_GUESSES = 8
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,8 @@ class MotionLayers:
 
     fields: tuple[MotionField, ...] = ()
     """Motion vectors, in the order of the table."""
+    guesses: tuple[MotionField, ...] = ()
+    """Layers of two or three channels of which nothing is known: the pixels may tell that they are vectors."""
     position: tuple[Channel, ...] | None = None
     """World-space position of the surface, X, Y, Z."""
     depth: Channel | None = None
@@ -117,7 +121,9 @@ class MotionLayers:
         return (x, y) if x and y else None
 
 
-def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty) -> MotionLayers:
+def find_motion_layers(
+    renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, read: Collection[Channel] = ()
+) -> MotionLayers:
     """Find the layers of motion vectors, position and depth.
 
     The names that are common to all renderers are tried behind those of the renderer.
@@ -126,6 +132,7 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
         renderer: entry of the table.
         layers: of the file.
         beauty: the one that was chosen; its view and view layer are searched.
+        read: channels that hold something else.
     """
     named = {name: layer for name, layer in beauty.layers_of_view(layers) if name}
     common = renderers()[-1]
@@ -140,10 +147,21 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
     plain = [Layer("", "", {"Z": beauty.layer.channels["Z"]})] if "Z" in beauty.layer.channels else []
     return MotionLayers(
         tuple(vectors.values()),
+        tuple(_guesses(named, known_as_other(renderer), read)),
         next((triple for _, layer in filter(None, positions) if (triple := layer.triple())), None),
-        next((layer.channels[c] for layer in [*depths, *plain] for c in "ZRVYT" if c in layer.channels), None),
+        next((channel for layer in [*depths, *plain] for channel in _depth_in(layer)), None),
         named,
     )
+
+
+def _guesses(
+    named: Mapping[str, Layer], is_known: Callable[[str], bool], read: Collection[Channel]
+) -> list[MotionField]:
+    """Return the layers of two or three channels that are neither known nor read, those of two channels first."""
+    unknown = {name: layer for name, layer in named.items() if len(layer.channels) in (2, 3) and not is_known(name)}
+    unread = [name for name, layer in unknown.items() if not set(read).intersection(layer.channels.values())]
+    unread.sort(key=lambda name: len(named[name].channels))
+    return [field for name in unread for field in _vectors_in(name, named[name], None, MotionFormat())][:MOST_GUESSES]
 
 
 def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionField]:
@@ -220,17 +238,26 @@ def _problem_of_word(key: str, equals: str, value: str) -> str:
 
 def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:
     """Return the layer that an alias means, and its short name."""
-    for name, layer in layers.items():
-        if view_layer_of(name, alias) == "" or same_spelling(name) == same_spelling(alias):
-            return name, layer
-    return None
+    meant = [name for name in layers if view_layer_of(name, alias) == "" or same_spelling(name) == same_spelling(alias)]
+    name = min(meant, key=lambda name: name != alias, default=None)
+    return None if name is None else (name, layers[name])
+
+
+def _depth_in(layer: Layer) -> list[Channel]:
+    """Return the channels of a layer of depth, best one first; 3Delight's only one is called 000."""
+    return [layer.channels[c] for c in "ZRVYT" if c in layer.channels] or [*(layer.scalar() or ())]
 
 
 def _fields(
     layers: Mapping[str, Layer], alias: str, components: Sequence[str] | None, form: MotionFormat
 ) -> Iterator[MotionField]:
-    """Yield the vectors of the layer that an alias means: in these channels, or in the first usual ones."""
-    name, layer = _named(layers, alias) or ("", Layer("", "", {}))
+    """Yield the vectors of the layer that an alias means."""
+    if found := _named(layers, alias):
+        yield from _vectors_in(*found, components, form)
+
+
+def _vectors_in(name: str, layer: Layer, components: Sequence[str] | None, form: MotionFormat) -> Iterator[MotionField]:
+    """Yield the vectors of a layer: in these channels, or in the first usual ones."""
     for pair in [tuple(components)] if components else _PAIRS:
         channels = [layer.channels[c] for c in pair if c in layer.channels]
         if len(channels) == 2 and all(c.type != "uint" for c in channels) and channels[0].part == channels[1].part:

@@ -3,18 +3,25 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, OPTIONAL_FEATURES, PAPER_FEATURES
 from oiio_msspl.exr.layers import Layer, same_spelling
 from oiio_msspl.exr.reader import ExrFile
+
+#: The words of a file's or folder's name that mean the beauty, where every AOV has a file of its own.
+_BEAUTY_WORD = re.compile(r"(?<![^\W_])(beauty|rgba?|combined|main|c|ci|image)(?![^\W_])", re.IGNORECASE)
+#: The end of a file's stem from its frame number on.
+_FRAME_NUMBER = re.compile(r"([._ -]-?\d+)?$")
 
 
 @lru_cache(maxsize=1)
@@ -27,6 +34,43 @@ def renderers() -> list[dict[str, Any]]:
 def detect_renderer(file: ExrFile, layers: list[Layer]) -> dict[str, Any]:
     """Find the entry of the renderer that wrote a file, by layers, header attributes and file name."""
     return next(entry for entry in renderers() if any(_holds(rule, file, layers) for rule in entry["detect"]))
+
+
+def candidates_of(renderer: Mapping[str, Any], feature: str) -> list[Any]:
+    """Return the candidates of a feature: those of the renderer, and then the names that mean the same nearly anywhere.
+
+    Light passes and variances have no such names: V-Ray's ``diffuse`` is the colour of the surface.
+    """
+    own, common = renderer.get(feature, []), renderers()[-1]
+    return own if feature in PAPER_FEATURES or renderer is common else [*own, *common[feature]]
+
+
+def known_as_other(renderer: Mapping[str, Any]) -> Callable[[str], bool]:
+    """Return what tells by the table whether a layer of a name is something else than a beauty."""
+    keys = (*OPTIONAL_FEATURES, "sets", "motion", "position", "depth", "data")
+    entries = [entry.get(key, []) for entry in (renderer, renderers()[-1]) for key in keys]
+    names = {same_spelling(name) for entry in entries for name in _names_in(entry)}
+    patterns = [name for name in names if "*" in name]
+
+    def is_known(layer: str) -> bool:
+        name = same_spelling(layer.removesuffix(".000"))
+        words = name.split(".")
+        ends = (".".join(words[start:]) for start in range(len(words)))  # a view layer may stand in front
+        return not names.isdisjoint(ends) or any(fnmatchcase(name, pattern) for pattern in patterns)
+
+    return is_known
+
+
+def _names_in(entry: object) -> Iterator[str]:
+    """Yield the names and patterns of layers in a candidate, or in a list of candidates."""
+    if isinstance(entry, str):
+        yield entry
+    elif isinstance(entry, list):
+        for element in entry:
+            yield from _names_in(element)
+    elif isinstance(entry, Mapping):
+        for key in ("layer", "layers", "sum", "times", "halves"):
+            yield from _names_in(entry.get(key, []))
 
 
 def entry_of(candidate: str | Mapping[str, Any]) -> Mapping[str, Any]:
@@ -51,24 +95,39 @@ def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) 
     return None
 
 
-def layer_of_source(renderer: dict[str, Any], file: ExrFile, aov: str) -> str | None:
-    """Return the layer that by the header holds an AOV under another name; None if none or several do.
+def names_of_aov(renderer: Mapping[str, Any], file: ExrFile, aov: str) -> list[str]:
+    """Return the names that the layer of an AOV may have: its own one, and that which the header gives.
 
+    V-Ray's header tells the type of every layer, so it comes first. Elsewhere a layer that is called like the AOV does.
     Several layers hold one AOV if lights are split into groups: none of the layers is the whole AOV.
     """
+    if (number := renderer.get("types", {}).get(aov)) is not None:
+        return [*_layers_of_type(renderer, file, number), aov]
     if "source" not in renderer:
-        return None
+        return [aov]
     named = (key for key, value in file.metadata.items() if same_spelling(str(value)) == same_spelling(aov))
     layers = {match[1] for key in named if (match := re.search(renderer["source"], key))}
-    return layers.pop() if len(layers) == 1 else None
+    return [aov, *layers] if len(layers) == 1 else [aov]
+
+
+def _layers_of_type(renderer: Mapping[str, Any], file: ExrFile, number: int) -> list[str]:
+    """Return the layer that has a type by the header's JSON; none if none or several have."""
+    try:
+        elements = json.loads(str(file.metadata.get(renderer["types"]["attribute"])))
+        layers = [name for name, element in elements.items() if element.get("alias") == number]
+    except (ValueError, AttributeError, RecursionError):  # no such attribute, or other contents
+        return []
+    return layers if len(layers) == 1 else []
 
 
 def view_layer_of(layer: str, alias: str) -> str | None:
     """Return the view layer in front of ``alias`` in the name of an EXR layer; None if it means another layer.
 
     It is ``ViewLayer`` for the layer ``ViewLayer.Combined`` and the alias ``combined``, and empty if the alias is the
-    whole name. Names are compared without case, spaces, ``_`` and ``-``; ``*`` in the alias matches any text.
+    whole name. Names are compared without case, spaces, ``_`` and ``-``; ``*`` in the alias matches any text. 3Delight
+    puts ``.000`` behind a layer's name.
     """
+    layer = layer.removesuffix(".000")
     name, wanted = same_spelling(layer), same_spelling(alias)
     if name == wanted or ("*" in wanted and fnmatchcase(name, wanted)):
         return ""
@@ -76,6 +135,11 @@ def view_layer_of(layer: str, alias: str) -> str | None:
         # Cut as many dots from the end of the stored name as the alias takes.
         return layer.rsplit(".", wanted.count(".") + 1)[0]
     return None
+
+
+def best_spelled(layers: Iterable[Layer], alias: str) -> Layer | None:
+    """Return the layer that has exactly the spelling of an alias, or else the first one; None if there are none."""
+    return min(layers, key=lambda layer: not layer.name.endswith(alias), default=None)
 
 
 def _holds(rule: dict[str, Any], file: ExrFile, layers: list[Layer]) -> bool:
@@ -107,6 +171,25 @@ def sibling_of(path: Path, aov: str) -> Path | None:
     return next((file for file in siblings_of(path, aov) if file != path and file.is_file()), None)
 
 
+def file_beside(path: Path, aov: str) -> Path | None:
+    """Return the file of an AOV whose name, or whose folder's, differs from that of the beauty ``path`` by one word.
+
+    Beside ``beauty/shot_beauty.1001.exr`` it is ``albedo/shot_albedo.1001.exr`` or the like, beside ``shot.1001.exr``
+    it is ``shot_albedo.1001.exr`` or ``shot.albedo.1001.exr``. None if there is no such file.
+    """
+    folder, head = path.parent.absolute(), _FRAME_NUMBER.sub("", path.stem)
+    folders = [folder, *(folder.with_name(name) for name in _with_word(folder.name, aov))]
+    stems = [*_with_word(path.stem, aov), path.stem]
+    files = [place / f"{stem}.exr" for place in folders for stem in stems]
+    files += [folder / f"{head}{sign}{aov}{path.stem[len(head) :]}.exr" for sign in "_." if head]
+    return next((file for file in files if file != path.absolute() and file.is_file()), None)
+
+
+def _with_word(name: str, aov: str) -> list[str]:
+    """Return a name with an AOV in the place of each word that means the beauty."""
+    return [name[: word.start()] + aov + name[word.end() :] for word in _BEAUTY_WORD.finditer(name)]
+
+
 def aov_files(path: Path) -> set[Path]:
     """Find the files of AOVs beside the beauty ``path`` by names, without opening the beauty."""
     names: set[str] = set()
@@ -114,7 +197,14 @@ def aov_files(path: Path) -> set[Path]:
         aovs = set(file_names(renderer))
         if aovs and any(_holds_by_name(rule, path) for rule in renderer["detect"]):
             names |= aovs
-    return {file for name in names if (file := sibling_of(path, name))}
+    beside = {file for feature in (ALBEDO, NORMAL) for aov in _aovs_beside(feature) if (file := file_beside(path, aov))}
+    return beside | {file for name in names if (file := sibling_of(path, name))}
+
+
+def _aovs_beside(feature: str) -> list[str]:
+    """Return the AOVs of :func:`file_beside` that a feature may be read from."""
+    names = (entry_of(candidate).get("layer", "") for candidate in renderers()[-1][feature])
+    return [name.removeprefix("beside:") for name in names if name.startswith("beside:")]
 
 
 def file_names(entry: object) -> Iterator[str]:

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from oiio_msspl.aovs.renderers import entry_of, view_layer_of
+from oiio_msspl.aovs.renderers import best_spelled, entry_of, view_layer_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, views_of
-from oiio_msspl.exr.reader import ExrFile
+from oiio_msspl.exr.reader import Channel, ExrFile
 
 
 class Beauty(NamedTuple):
@@ -46,17 +46,46 @@ def find_beauties(file: ExrFile, layers: list[Layer], candidates: Sequence[Any])
     """
     for candidate in candidates:
         alias = entry_of(candidate).get("layer", "")
-        beauties = [
-            Beauty(layer.view, view_layer, layer)
-            for layer in layers
-            if (view_layer := view_layer_of(layer.name, alias)) is not None and layer.triple()
-        ]
+        named: dict[tuple[str, str], list[Layer]] = {}
+        for layer in layers:
+            if (view_layer := view_layer_of(layer.name, alias)) is not None and layer.triple():
+                named.setdefault((layer.view, view_layer), []).append(layer)
+        beauties = [Beauty(*place, best_spelled(group, alias) or group[0]) for place, group in named.items()]
         if any(beauty.view for beauty in beauties):
             views = list(dict.fromkeys([*views_of(file), *(beauty.view for beauty in beauties)]))
             return sorted(beauties, key=lambda beauty: (beauty.view_layer, views.index(beauty.view)))
         if beauties:
             return beauties
     return []
+
+
+def only_colour(layers: list[Layer], is_known: Callable[[str], bool]) -> list[str]:
+    """Return the name of the only layer of R, G, B that is not known as something else; nothing if there are several.
+
+    Args:
+        layers: of the file; a name may occur once in each view.
+        is_known: tells whether a layer of a name is known as something else.
+    """
+    colours = (
+        layer for layer in layers if {"R", "G", "B"} <= layer.channels.keys() and layer.channels["R"].type != "uint"
+    )
+    names = {layer.name for layer in colours if not is_known(layer.name)}
+    return list(names) if len(names) == 1 else []
+
+
+def find_alpha(layers: Iterable[Layer], beauty: Beauty) -> Channel | None:
+    """Return the alpha of a beauty: its own, or that of a layer of its view and view layer that holds no colour.
+
+    RenderMan writes ``a`` beside ``Ci.r``, and other programs write a layer or part ``alpha``.
+    """
+    if "A" in beauty.layer.channels:
+        return beauty.layer.channels["A"]
+    beside = [layer for layer in layers if layer.view == beauty.view and not layer.triple()]
+    alphas = [layer.channels.get("A") for layer in beside if layer.name == beauty.view_layer]
+    for layer in beside:
+        if view_layer_of(layer.name, "alpha") == beauty.view_layer:
+            alphas += [layer.channels.get("A"), *(layer.scalar() or ())]
+    return next(filter(None, alphas), None)
 
 
 def choose_beauty(file: ExrFile, beauties: list[Beauty], wanted: str | None) -> Beauty:

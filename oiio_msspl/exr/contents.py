@@ -59,7 +59,7 @@ class FileContents:
     source: ExrFile
     """The HRLS."""
     beauty: tuple[Channel, ...]
-    """Channels R, G, B and perhaps A of the HRLS, which the fused pixels replace."""
+    """Channels R, G, B and perhaps A of the HRLS, which the fused pixels replace; no alpha of another part."""
     dropped: frozenset[Channel]
     """Channels of the HRLS that are left out."""
     pixels: FusedPixels
@@ -98,7 +98,13 @@ def lossless(part: Part) -> str:
 
 def stored_type(beauty: Sequence[Channel], options: WriteOptions) -> str:
     """Return the pixel type in which the fused beauty is written: ``half`` or ``float``."""
-    return options.pixel_type or ("float" if any(channel.type == "float" for channel in beauty) else "half")
+    types = {channel.type for channel in without_alpha_apart(beauty)}
+    return options.pixel_type or ("float" if "float" in types else "half")
+
+
+def without_alpha_apart(beauty: Sequence[Channel]) -> tuple[Channel, ...]:
+    """Return the channels of a beauty without an alpha that lies in a part of its own, where it stays."""
+    return tuple(beauty[:3] if beauty[-1].part != beauty[0].part and len(beauty) > 3 else beauty)
 
 
 def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequence[str]) -> frozenset[Channel]:

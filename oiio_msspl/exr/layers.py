@@ -94,10 +94,18 @@ def _split_name(name: str, part: Part, views: list[str], *, several: bool) -> tu
     """Return view, layer and component of a channel, in a file of one part or of several."""
     prefix, _, component = name.rpartition(".")
     view = part.view or (views[0] if views else "")
-    # In a multiView file, and perhaps in a part of one view, the view may stand in the name: diffuse.left.R.
-    if (last := prefix.rpartition(".")[2]) and last in (*views, part.view):
-        prefix, _, view = prefix.rpartition(".")
-    return view, prefix or (_part_layer(part) if several else ""), _COMPONENTS.get(component.lower(), component)
+    # In a multiView file, and perhaps in a part of one view, the view may stand in the name: diffuse.left.R. Nuke puts
+    # it in front: left.diffuse.R.
+    words = prefix.split(".")
+    for place in (-1, 0):
+        if words[place] and words[place] in (*views, part.view):
+            view = words.pop(place)
+            break
+    return (
+        view,
+        ".".join(words) or (_part_layer(part) if several else ""),
+        _COMPONENTS.get(component.lower(), component),
+    )
 
 
 def _part_layer(part: Part) -> str:

@@ -29,7 +29,7 @@ _SHARED = ("PixelAspectRatio", "chromaticities", "smpte:TimeCode")
 #: Attributes that every part keeps. OpenImageIO would fill in defaults for the first three.
 _KEPT_IN_EVERY_PART = (
     *("screenWindowWidth", "screenWindowCenter", "DateTime"),
-    *(*_SHARED, "view", "name", "oiio:subimagename", "compression"),
+    *(*_SHARED, "colorInteropID", "view", "name", "oiio:subimagename", "compression"),
 )
 
 #: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.

@@ -52,7 +52,7 @@ def check_view(view: str) -> None:
     """Raise InputError if the OpenColorIO configuration has no such view."""
     views = oiio.ColorConfig(OCIO_CONFIG).getViewNames(OCIO_DISPLAY)
     if view not in views:
-        raise InputError(f"--view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")
+        raise InputError(f"--ocio-view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")
 
 
 def write_preview(

@@ -142,5 +142,7 @@ def _header(contents: FileContents) -> dict[str, Any]:
         header.pop("view", None)
         header["multiView"] = list(views)
     name = "NO" if contents.compression == "none" else contents.compression.upper()
-    compression = getattr(OpenEXR, f"{name}_COMPRESSION")
+    compression = getattr(OpenEXR, f"{name}_COMPRESSION", None)
+    if compression is None:
+        raise InputError(f"--compression {contents.compression}: OpenEXR {OpenEXR.__version__} lacks it; name another")
     return header | {"compression": compression, "type": OpenEXR.scanlineimage} | contents.attributes

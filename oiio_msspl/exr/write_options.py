@@ -14,9 +14,9 @@ LAYOUTS = {
     "multilayer": "a single part with all channels",
 }
 #: Compressions that keep every bit.
-LOSSLESS = ("none", "rle", "zip", "zips", "piz")
-#: All compressions of OpenEXR that can be written.
-COMPRESSIONS = (*LOSSLESS, "pxr24", "b44", "b44a", "dwaa", "dwab")
+LOSSLESS = ("none", "rle", "zip", "zips", "piz", "htj2k256", "htj2k32", "zstd")
+#: All compressions of OpenEXR 3.5. Older versions lack zstd, lj2k and perhaps htj2k.
+COMPRESSIONS = (*LOSSLESS, "pxr24", "b44", "b44a", "dwaa", "dwab", "lj2k")
 #: Replaces a lossy compression of the source.
 DEFAULT_COMPRESSION = "zip"
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import not_written, replacing
-from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type
+from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type, without_alpha_apart
 from oiio_msspl.exr.part_specs import (
     PassedOnPart,
     beauty_spec,
@@ -77,17 +77,36 @@ def write_fused(
         InputError: the layout can't hold these parts, a layer can't be read, or ``path`` exists.
         MssplError: the file can't be written; a file at ``path`` is untouched.
     """
-    pixels = FusedPixels(rgb, alpha, extra, stored_type(beauty, options))
     dropped = dropped_channels(source, beauty, options.layers)
-    contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options, replaced)
+    warnings = [
+        f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
+        for part in source.parts
+        if part.deep
+    ]
+    colour = without_alpha_apart(beauty)
+    if len(colour) < len(beauty) and alpha is not None:
+        replaced = replaced or ReplacedChannels()
+        warnings += _replace_alpha(replaced, source, beauty, alpha)
+        alpha = None
+    pixels = FusedPixels(rgb, alpha, extra, stored_type(beauty, options))
+    contents = FileContents(source, colour, dropped, pixels, attributes, options, replaced)
     with replacing(path, overwrite=overwrite, before_rename=before_rename) as temporary:
         if options.layout == "multilayer":
             write_single_part(temporary, contents)
         else:
             _write_parts(temporary, contents, cache_bytes)
-        _check_whole(temporary, path)
-    deep = (part for part in source.parts if part.deep)
-    return [f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on" for part in deep]
+        _check_whole(temporary, path, contents.compression)
+    return warnings
+
+
+def _replace_alpha(replaced: ReplacedChannels, source: ExrFile, beauty: Sequence[Channel], alpha: Array) -> list[str]:
+    """Put the alpha of another part where it was. Return a warning if that part has another data window."""
+    channel = beauty[-1]
+    if source.parts[channel.part].data_window != source.parts[beauty[0].part].data_window:
+        return ["the alpha has another data window than the beauty, so it is passed on as it is"]
+    replaced.add([channel], alpha.shape[1], alpha.shape[0])
+    replaced.put(channel, 0, alpha[..., 0])
+    return []
 
 
 def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str]) -> None:
@@ -125,7 +144,7 @@ def _without_pixels(
     nothing = np.empty((0, 0, 3), np.float32)
     pixels = FusedPixels(nothing, None, dict.fromkeys(extra, nothing), stored_type(beauty, options))
     dropped = dropped_channels(source, beauty, options.layers)
-    return FileContents(source, tuple(beauty), dropped, pixels, {}, options)
+    return FileContents(source, without_alpha_apart(beauty), dropped, pixels, {}, options)
 
 
 def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
@@ -155,16 +174,22 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
         raise not_written(path.parent, reason_of(writer) if writer.has_error else "no reason given")
 
 
-def _check_whole(temporary: Path, path: Path) -> None:
-    """Read the first and last row of every part: OpenImageIO does not tell if a full disk cut off the file's end."""
+def _check_whole(temporary: Path, path: Path, compression: str) -> None:
+    """Read the first and last row of every part: OpenImageIO does not tell if a full disk cut off the file's end.
+
+    Nor does it tell that it lacks a compression, and writes zip.
+    """
     try:
         with closing(open_exr(temporary)) as file:
+            written = file.parts[0].compression
             for part in file.parts:
                 window = part.data_window
                 for y in (window.y0, window.y1 - 1):
                     file.read(part.channels[:1], Window(window.x0, y, window.x1, y + 1))
     except InputError as error:
         raise not_written(path.parent, "its end is missing") from error
+    if written != compression:
+        raise InputError(f"--compression {compression}: this OpenImageIO writes {written} instead; name another one")
 
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:

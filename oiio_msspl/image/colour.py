@@ -61,7 +61,10 @@ P3 = ColourSpace(
     (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65),
     ("lin_p3d65_scene", "linear p3-d65", "utility - linear - p3-d65"),
 )
-SPACES = (REC709, ACESCG, ACES2065, REC2020, P3)
+ADOBE = ColourSpace(
+    "lin_adobergb", (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, *_D65), ("lin_adobergb_scene", "linear adobergb")
+)
+SPACES = (REC709, ACESCG, ACES2065, REC2020, P3, ADOBE)
 
 #: Names in lower case that OpenImageIO writes by default, so they say nothing of the space.
 _INDEFINITE = ("", "linear", "scene_linear", "lin_rec709")
@@ -120,9 +123,11 @@ def named_space(name: str) -> ColourSpace | None:
 def space_of(metadata: Mapping[str, Any]) -> ColourSpace | None:
     """Return the linear space that an EXR's header declares; None if it declares none.
 
-    ``chromaticities`` comes first, because it is OpenEXR's own attribute. ``oiio:ColorSpace`` counts only with a
-    definite name.
+    ``colorInteropID`` comes first: programs that convert colours set it, and often keep old ``chromaticities``.
+    ``oiio:ColorSpace`` counts only with a definite name.
     """
+    if (space := named_space(str(metadata.get("colorInteropID") or ""))) is not None:
+        return space
     values = metadata.get("chromaticities")
     if isinstance(values, tuple) and len(values) == 8 and all(isinstance(v, float) and np.isfinite(v) for v in values):
         stored = ColourSpace(f"the space with the chromaticities {', '.join(f'{v:.4g}' for v in values)}", values)

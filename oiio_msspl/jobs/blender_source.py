@@ -195,6 +195,8 @@ class RenderedShot:
         self._renders[files.number] = files
         for frame in run.take(views):
             self._at_work = frame.number
+            kept = str(beside(frame.files.output, "lr")), str(beside(frame.files.output, "hr"))
+            frame.report.sources = kept if self._keep else ("a render that was not kept",) * 2
             write_settled(frame, run.existing)
             self._warnings[frame.files.output] = frame.report.warnings
 

@@ -6,9 +6,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapping import split_exr
+from oiio_msspl.aovs.renderers import file_names
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, make_folder
 from oiio_msspl.exr.write_options import (
@@ -25,12 +29,13 @@ from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.memory import check_frame_memory
 from oiio_msspl.jobs.pair_check import check_files
-from oiio_msspl.jobs.passes import check_passes
+from oiio_msspl.jobs.passes import check_passes, sets_to_fuse
 from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
-from oiio_msspl.jobs.sequence import FrameFiles, Shot
+from oiio_msspl.jobs.sequence import FrameFiles, Shot, frame_in_name
 from oiio_msspl.jobs.settings import Settings, choose_model
 from oiio_msspl.jobs.views import find_other_views
-from oiio_msspl.model.catalogue import family_of, for_spread_noise
+from oiio_msspl.model.catalogue import family_of, find_model, for_spread_noise
+from oiio_msspl.model.contract import Contract
 
 log = logging.getLogger(__name__)
 
@@ -39,12 +44,28 @@ def check_output(shot: Shot, inputs: InputOptions, model: str | None, more_targe
     """Check that the frames and ``more_targets`` can be written. The output folder may be missing.
 
     Raises:
-        InputError: the folder can't be written to, or a result would replace an input.
+        InputError: the folder can't be written to, a result would replace an input, or a mapping names one file of a
+            sequence.
     """
     folder = shot.output.folder
+    check_mapped_sequences(shot.frames, inputs)
     check_no_file(folder)
     check_folder(shot.output.path(0) if folder.exists() else folder)
     check_no_input(shot, inputs, model, more_targets)
+
+
+def check_mapped_sequences(frames: Sequence[FrameFiles], inputs: InputOptions) -> None:
+    """Raise InputError if a mapping names one file of a sequence for all frames of a shot."""
+    numbers = {frame.number for frame in frames}
+    for name in file_names(inputs.mapping):
+        path = Path(split_exr(name)[0])
+        if not path.is_file() or (numbered := frame_in_name(path)) is None:
+            continue
+        pattern = numbered[0]
+        if sum(pattern.path(number).is_file() for number in numbers) > 1:
+            raise InputError(
+                f"{path}: is one frame of a sequence, and would be read for all frames of the shot; write {pattern}"
+            )
 
 
 def make_output(shot: Shot) -> None:
@@ -99,13 +120,18 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
 def check_no_input(
     shot: Shot, inputs: InputOptions, model: str | None = None, more_targets: Iterable[Path] = ()
 ) -> None:
-    """Raise InputError if a file that is written is one of the shot's inputs, or is written twice.
+    """Raise InputError if a file that is written is one of the shot's inputs, is written twice, or lies among the LRHS.
+
+    The next run would take results in the LRHS's folder for renders.
 
     All files of both sequences are inputs, whichever frames are to be fused: neighbours and the plan over time are read
     from other frames, and no run may replace the render of a frame.
     """
     pairs = {*shot.lr.files.values(), *shot.hr.files.values()}
     others = [inputs.files(path, model) for path in shot.hr.files.values()]
+    folder, low = shot.output.folder, shot.lr.pattern.folder
+    if shot.output.number is shot.hr.pattern.number and folder.is_dir() and folder.samefile(low):
+        raise InputError(f"{folder}: holds renders that this run reads; name another folder for the results")
     check_separate(pairs.union(*others), [*(path for frame in shot.frames for path in frame.targets), *more_targets])
 
 
@@ -139,6 +165,33 @@ def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list
     return []
 
 
+def look_ahead(frames: Sequence[FrameFiles], settings: Settings) -> dict[str, Any] | None:
+    """Describe the first pair that can be read by its headers, see :attr:`.ShotReport.found`.
+
+    Raises:
+        InputError: there is no such model.
+    """
+    for frame in frames:
+        if frame.lr is None or frame.hr is None:
+            continue
+        try:
+            lr, hr = map_pair(frame.lr, frame.hr, settings.inputs)
+            scale = align(lr, hr).scale
+            views = [hr, *find_other_views(lr, hr, settings.inputs, settings.write).hrls]
+            sets = {
+                additive.name: additive.layer_names for view in views for additive in sets_to_fuse(view, settings.write)
+            }
+        except InputError as error:  # the run says so when its turn comes
+            log.debug("frame %d: %s", frame.number, error)
+            continue
+        contract = Contract.of_file(find_model(scale, settings.model))
+        hr = hr.for_model(contract.hrls)
+        found = {"frame": frame.number, "renderer": hr.renderer, "scale": contract.scale, "model": contract.name}
+        names = [name_of(view.view) for view in views] if hr.other_views else []
+        return found | {"aovs": hr.table(contract.hrls), "notes": hr.notes, "views": names, "sets": sets}
+    return None
+
+
 def check_wanted_outputs(
     frames: Sequence[FrameFiles], inputs: InputOptions, write: WriteOptions, model: str | None, max_memory: int
 ) -> None:
@@ -149,6 +202,7 @@ def check_wanted_outputs(
             can't hold the layers, the model is for another scale or does not make a layer, or ``max_memory`` bytes are
             too few.
     """
+    check_mapped_sequences(frames, inputs)
     problem: InputError | None = None
     for frame in frames:
         if frame.lr is None or frame.hr is None:

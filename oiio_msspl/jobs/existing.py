@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +16,9 @@ from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, older_than, result_of
+
+#: Seconds by which the clocks of two machines may differ.
+CLOCK_SKEW = 60
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,14 @@ class ExistingResults:
         renders = [files.lr, files.hr, *self.plan.files_beside(files.hr)]
         paths = files_by_name(renders, files.hr, self.settings.inputs, self.settings.model)
         return [path for path in paths if path.is_file() and path.stat().st_mtime > written]
+
+    def dated_in_future(self, frames: Sequence[FrameFiles]) -> Path | None:
+        """Return a file whose date lies in the future, so that ``update`` can't tell what is newer; None without."""
+        latest = time.time() + CLOCK_SKEW
+        paths = (
+            path for files in frames for path in (files.lr, files.hr, files.output) if self.settings.update and path
+        )
+        return next((path for path in paths if path.is_file() and path.stat().st_mtime > latest), None)
 
     def known_result(self, files: FrameFiles, shot: Shot) -> FrameResult | None:
         """Return the result of a frame that need not or can't be fused; None for a frame to fuse."""

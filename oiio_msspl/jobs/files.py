@@ -17,11 +17,12 @@ from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.inputs import InputOptions, both_paths
 from oiio_msspl.jobs.memory import memory_to_write
+from oiio_msspl.jobs.passes import WHOLE
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, is_sequence
-from oiio_msspl.jobs.settings import Settings, choose_model
+from oiio_msspl.jobs.settings import Settings, bytes_of, choose_model
 from oiio_msspl.jobs.write import write_settled
 
 
@@ -35,8 +36,8 @@ def fuse_files(
     model: str | None = None,
     device: str = "cpu",
     threads: int = 0,
-    max_memory: int = MAX_MEMORY,
-    preview_path: str | Path | None = None,
+    max_memory: int | str = MAX_MEMORY,
+    preview_path: str | Path | bool | None = None,
     view_transform: str | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -53,11 +54,11 @@ def fuse_files(
             are the default quality, see :func:`oiio_msspl.model.catalogue.find_model`.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
-        max_memory: bytes that the process should stay below. The result does not depend on it.
-        preview_path: PNG to write, or None.
+        max_memory: bytes that the process should stay below, also as ``4G``. The result does not depend on it.
+        preview_path: PNG to write; True for one beside the result, None for none.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
-        progress: called with (steps done, steps in all). A step is a tile, or a band of rows of a set of passes.
+        progress: called with (thousandths done, 1000) of the whole work, from reading to writing.
 
     Returns:
         What was read, fused and written.
@@ -72,14 +73,20 @@ def fuse_files(
         raise InputError(f"{output}: the result is an EXR; name it .exr")
     if is_sequence(output):
         raise InputError(f"{output}: is a pattern, but LR and HR are single files; name one file")
-    if preview_path is not None:
+    max_memory = bytes_of(max_memory)
+    if preview_path is True:
+        preview_path = output.with_suffix(".png")
+    if preview_path:
         preview_path = check_target(preview_path, overwrite=overwrite)
         if preview_path.suffix.lower() != ".png":
             raise InputError(f"{preview_path}: the preview is a PNG; name it .png")
         if view_transform is not None:
             check_view(view_transform)
     settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite)
-    files = FrameFiles(0, *both_paths(lr_path, hr_path), output, preview_path)
+    preview = Path(preview_path) if preview_path else None
+    files = FrameFiles(0, *both_paths(lr_path, hr_path), output, preview)
+    if progress is not None:
+        progress(0, WHOLE)
     run = ShotRun(settings, ShotPlan(), [files], only_frame=True, tell=progress)
     views = run.read(files)
     frame = views[0]
@@ -97,4 +104,6 @@ def fuse_files(
     frame.report.seconds |= {"read": opened - start, "fuse": time.perf_counter() - opened}
     with limit_threads(threads):
         write_settled(frame, run.existing, only_frame=True)
+    if frame.progress is not None:
+        frame.progress.end()
     return frame.report

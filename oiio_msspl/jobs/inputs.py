@@ -13,12 +13,14 @@ from typing import Any, NamedTuple
 from oiio_msspl.aovs.candidates import mapped_files
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.renderers import aov_files
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import layer_by_channel
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.image.colour import REC709, SPACES, ColourSpace, encoding_of, named_space, same_space, space_of
+from oiio_msspl.jobs.sequence import frame_in_name, is_sequence, parse_pattern
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class InputOptions:
     """Facts about the two files that they do not say themselves."""
 
     mapping: Mapping[str, Any] = field(default_factory=dict)
-    """The user's own layer for each feature, see :func:`oiio_msspl.aovs.matching.map_render`."""
+    """The user's own layer for each feature, see :func:`oiio_msspl.aovs.matching.map_render`. The names of files may be
+    patterns such as ``albedo.####.exr``."""
     view: str | None = None
     """The only view or view layer to use; None for all, the HRLS's first one in front."""
     lr_spp: float | None = None
@@ -55,7 +58,30 @@ class InputOptions:
     def files(self, hr_path: Path, model: str | None) -> set[Path]:
         """Return the files that a frame is made from beside the pair: those of the mapping, and a user's model."""
         named = [self.map_file, None if model is None else Path(model)]
-        return mapped_files(self.mapping, hr_path) | {path for path in named if path is not None}
+        return mapped_files(self.mapping_of(hr_path), hr_path) | {path for path in named if path is not None}
+
+    def mapping_of(self, hr_path: Path) -> dict[str, Any]:
+        """Return the mapping with the files of the frame whose HRLS this is in the place of patterns.
+
+        Raises:
+            InputError: there is a pattern, and the name of the HRLS has no frame number.
+        """
+        return {feature: _file_of_frame(candidate, hr_path) for feature, candidate in self.mapping.items()}
+
+
+def _file_of_frame(value: Any, hr_path: Path) -> Any:
+    """Return a candidate, or a part of one, with the file of a frame in the place of a pattern."""
+    if isinstance(value, Mapping):
+        return {key: _file_of_frame(element, hr_path) for key, element in value.items()}
+    if isinstance(value, list):
+        return [_file_of_frame(element, hr_path) for element in value]
+    name, layer = split_exr(value.removeprefix("file:"))
+    if not value.startswith("file:") or not name or Path(name).is_dir() or not is_sequence(Path(name)):
+        return value
+    numbered = frame_in_name(hr_path)
+    if numbered is None:
+        raise InputError(f"{name}: is a pattern, but {hr_path} has no frame number in its name; name one file")
+    return f"file:{parse_pattern(Path(name)).path(numbered[1])}" + (f":{layer}" if layer else "")
 
 
 class MappedPair(NamedTuple):
@@ -193,7 +219,7 @@ def map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
 
 
 def _map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
-    return map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp, sums=inputs.sums)
+    return map_render(file, inputs.mapping_of(file.path), view=inputs.view, spp=inputs.hr_spp, sums=inputs.sums)
 
 
 def _features_of_others(render: MappedRender) -> set[str]:

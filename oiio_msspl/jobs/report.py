@@ -12,6 +12,7 @@ from typing import Any
 
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
+from oiio_msspl.aovs.features import ALBEDO
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.exr.contents import dropped_channels
@@ -25,7 +26,7 @@ from oiio_msspl.model.session import Session
 LEAST_SHARE = 1 / 8
 
 
-@dataclass
+@dataclass(repr=False)
 class FrameReport:
     """The account of a fused pair, for people and, as :meth:`as_dict`, for programs."""
 
@@ -67,9 +68,15 @@ class FrameReport:
     about all views; those of another view than the first have its name in front."""
     fused_sets: list[AdditiveSet] = field(default_factory=list)
     """The additive sets that were fused."""
+    sources: tuple[str, str] | None = None
+    """What the result names as its LRHS and HRLS; None for their files."""
     layers: list[str] = field(default_factory=list)
     """The layers of the HRLS that are written beside the beauty, of all views, or their channels if they have no name.
     In a file with views (``left``) they are ``VIEW: LAYER``."""
+
+    def __repr__(self) -> str:
+        """Return one line; :meth:`as_dict` has everything."""
+        return f"<{self.output}, fused at x{self.scale} with {self.model}, {len(self.warnings)} warnings>"
 
     @property
     def is_one_render(self) -> bool:
@@ -113,6 +120,7 @@ class FrameReport:
             "view": self.hr.view or None,
             "other_views": self.hr.other_views,
             "fused_views": [{"view": view.hr.view or None, "aovs": view.aovs()} for view in self.fused_views()],
+            "size": self.hr.display_window.size,
             "scale": self.scale,
             "spp": {"lrhs": None if self.is_one_render else self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
@@ -149,7 +157,12 @@ def report_on(
         preview=preview_path,
         repaired=fused.repaired,
         negative=fused.negative,
-        warnings=[*spp_warnings(lr, hr, session.contract), *fused.warnings, *_pass_warnings(hr, fused)],
+        warnings=[
+            *_aov_warnings(hr, session.contract),
+            *spp_warnings(lr, hr, session.contract),
+            *fused.warnings,
+            *_pass_warnings(hr, fused),
+        ],
         tiles=fused.tiles,
         seconds={},
         features=frozenset(session.contract.hrls),
@@ -206,6 +219,13 @@ def _passes(fused: FusedFrame) -> dict[str, str]:
     return texts | refused
 
 
+def _aov_warnings(hr: MappedRender, contract: Contract) -> list[str]:
+    """Warn if the model reads an albedo and there is none."""
+    if ALBEDO not in contract.hrls or ALBEDO in hr.features:
+        return []
+    return ["no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"]
+
+
 def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:
     """Warn of samples per pixel that the method or the model was not made for."""
     if contract.scale == ONE_SIZE:
@@ -243,7 +263,8 @@ def provenance(report: FrameReport) -> dict[str, str]:
     sum of the layers, and of the products of light and colour, is the fused beauty. The names are those of the HRLS.
     """
     views = {"msspl/views": ", ".join(name_of(view.hr.view) for view in report.fused_views())}
-    second = {} if report.is_one_render else {"msspl/lrhs": report.lr.name, "msspl/spp_lrhs": _spp(report.lr.spp)}
+    lrhs, hrls = report.sources or (report.lr.name, report.hr.name)
+    second = {} if report.is_one_render else {"msspl/lrhs": lrhs, "msspl/spp_lrhs": _spp(report.lr.spp)}
     return (
         (views if report.other_views else {})
         | second
@@ -251,7 +272,7 @@ def provenance(report: FrameReport) -> dict[str, str]:
             "msspl/version": __version__,
             "msspl/model": report.model,
             "msspl/scale": str(report.scale),
-            "msspl/hrls": report.hr.name,
+            "msspl/hrls": hrls,
             "msspl/spp_hrls": _spp(report.hr.spp),
             "msspl/spp_average": _spp(report.spp_avg),
             "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),

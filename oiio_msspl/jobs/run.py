@@ -38,7 +38,7 @@ from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State
 from oiio_msspl.jobs.inputs import MappedPair
 from oiio_msspl.jobs.memory import check_frame_memory, light_features
-from oiio_msspl.jobs.passes import Progress, sets_to_fuse, steps_of, uses_clean_aovs
+from oiio_msspl.jobs.passes import Progress, costs_of, sets_to_fuse, uses_clean_aovs
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.read import features_read, read_frame
 from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, written_layers
@@ -56,7 +56,7 @@ class ShotRun:
         settings, plan: how frames are fused.
         wanted: the frames to write.
         only_frame: the shot is a single frame, which has all memory to itself.
-        tell: called with (steps done, steps in all) of the work on a single frame.
+        tell: called with (thousandths done, 1000) of the work on a single frame.
         stops_at: the first error of a frame is raised, and not passed on with the frame, after a call with its number.
     """
 
@@ -287,8 +287,8 @@ class ShotRun:
         """Return what joins the progress of all parts of the work on a single frame."""
         if self._tell is None:
             return None
-        pairs = [(view.lr, view.hr) for view in (frame, *frame.others)]
-        return Progress(self._tell, steps_of(pairs, frame.session, frame.write))
+        pairs = [(view.lr, view.hr) for view in (*frame.others, frame)]
+        return Progress(self._tell, costs_of(pairs, frame.session, frame.write))
 
     def _release(self) -> None:
         """Forget what no frame needs any more."""

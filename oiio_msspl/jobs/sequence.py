@@ -16,6 +16,7 @@ from pathlib import Path
 
 import fileseq
 
+from oiio_msspl.aovs.renderers import aov_files
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.model.contract import SCALES
@@ -23,12 +24,12 @@ from oiio_msspl.model.contract import SCALES
 #: The frame number in a pattern, as Nuke, Katana, Python and Houdini write it. fileseq reads all of these, but splits
 #: the name around them differently: it takes the digits of ``v2####.exr`` for a frame range, it finds no number in
 #: ``a.####_v2.exr``, it takes ``a.#.##.exr`` for subframes, and it refuses a folder named ``lr#1``.
-_NUMBER_FIELD = re.compile(r"#+|@@+|%\d+d|\$F\d*")
+_NUMBER_FIELD = re.compile(r"##+|@@+|%\d+d|\$F\d*")
 
 #: The shortest forms of a frame number, for names without a longer one. They also occur in ordinary names
-#: (``still@2x.exr``, ``100%done.exr``), so ``@`` counts only between separators, and ``%d`` only if no letter or digit
-#: follows.
-_SHORT_FIELD = re.compile(r"(?<![^._ -])@(?![^._ -])|%d(?![^\W_])")
+#: (``still@2x.exr``, ``100%done.exr``, ``take#2.exr``), so ``@`` counts only between separators, and ``%d`` and ``#``
+#: only if no letter or digit follows.
+_SHORT_FIELD = re.compile(r"(?<![^._ -])@(?![^._ -])|(%d|#)(?![^\W_])")
 
 #: A name whose number is not at its end, such as ``anim.0001_lr.exr``: head, number, tail. A number after a letter does
 #: not count: it may be a version or a size (``v002``, ``x2``). In ``a_v2.0001_lr.exr``, fileseq finds frame 2.
@@ -39,6 +40,9 @@ _NUMBER_LAST = re.compile(r"(|.*?[^vV\d])(\d+)(\.exr)", re.IGNORECASE)
 
 #: The end of a name before the number of a version.
 _VERSION = re.compile(r"(?<![^\W_])v$", re.IGNORECASE)
+
+#: What a sub-frame has beside its frame: ``.50`` in ``shot.1001.50.exr``.
+_SUB_FRAME = re.compile(r"(?<=\d)\.\d+(?=\.exr$)", re.IGNORECASE)
 
 #: One digit for a ``#``, as in Nuke, Katana and RV. fileseq's default is four digits.
 _PAD_STYLE = fileseq.constants.PAD_STYLE_HASH1
@@ -314,6 +318,8 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     """Find the sequences of EXRs in a folder, by name. Versions (``still_v001.exr``) are not frames."""
     # Hidden files may be half written.
     names = sorted(name for name in os.listdir(folder) if name.lower().endswith(".exr") and not name.startswith("."))
+    frames = set(names)
+    names = [name for name in names if _SUB_FRAME.sub("", name, count=1) not in frames - {name}]
     inside = [match for match in map(_NUMBER_INSIDE.fullmatch, names) if match]
     others = [name for name in names if not _NUMBER_INSIDE.fullmatch(name)]
     by_name: dict[tuple[str, str], list[tuple[int, int, str]]] = {}
@@ -350,8 +356,11 @@ def _only(sequences: list[Sequence], path: Path) -> Sequence:
 
 
 def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> tuple[Sequence, Sequence]:
-    """Choose the two sequences that belong together: the only ones, or the only ones with equal names."""
-    pairs = [(low, high) for low in lows for high in highs]
+    """Choose the two sequences that belong together: the only ones, or the only ones with equal names.
+
+    Where each AOV has files of its own, those of the beauty count.
+    """
+    pairs = [(low, high) for low in _with_aovs(lows) for high in _with_aovs(highs)]
     if len(pairs) > 1:
         pairs = [(low, high) for low, high in pairs if low.pattern.base == high.pattern.base]
     if len(pairs) == 1:
@@ -369,6 +378,11 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
         f"which sequences belong together? {seen}, and {why}; "
         f"name the two, the low-resolution one first{_example(pairs or list(itertools.product(lows, highs)))}"
     )
+
+
+def _with_aovs(sequences: list[Sequence]) -> list[Sequence]:
+    """Return the sequences beside whose files lie files of albedo or normals; all if there are none."""
+    return [sequence for sequence in sequences if aov_files(next(iter(sequence.files.values())))] or sequences
 
 
 def _example(pairs: list[tuple[Sequence, Sequence]]) -> str:

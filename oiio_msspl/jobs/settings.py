@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.errors import InputError
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.neighbours.renders import RenderPair
@@ -17,6 +19,9 @@ from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of, for_spread_noise, load_model
 from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.session import Session
+
+#: Bytes above which a size is a slip. Larger numbers are infinite as floats.
+LARGEST_MEMORY = 1 << 62
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,23 @@ class Settings:
         if self.write.data_passes:
             session.require_clean_aovs()
         return session
+
+
+def bytes_of(size: int | str) -> int:
+    """Return the number of bytes that ``3G``, ``800M`` or a number means.
+
+    Raises:
+        InputError: the text can't be read, or no machine has so much memory.
+    """
+    if isinstance(size, int):
+        return size
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", size.strip(), re.IGNORECASE)
+    if not match:
+        raise InputError(f"--max-memory {size!r}: write it as 3G or 800M")
+    number = float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " ")
+    if number > LARGEST_MEMORY:
+        raise InputError("--max-memory: the number is too large; write it as 3G or 800M")
+    return int(number)
 
 
 def choose_model(

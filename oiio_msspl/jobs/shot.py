@@ -21,7 +21,7 @@ from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.checks import check_first_pair, check_output, make_output, model_of_shot
+from oiio_msspl.jobs.checks import check_first_pair, check_output, look_ahead, make_output, model_of_shot
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.farm.dask import fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
@@ -29,7 +29,7 @@ from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions, plan_temporal
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, Shot, find_shot
-from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.settings import Settings, bytes_of
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.model.devices import require_device
 
@@ -55,13 +55,14 @@ def fuse_shot(
     model: str | None = None,
     device: str = "cpu",
     threads: int = 0,
-    max_memory: int = MAX_MEMORY,
+    max_memory: int | str = MAX_MEMORY,
     previews: bool = False,
     view_transform: str | None = None,
     overwrite: bool = False,
     skip_existing: bool = False,
     update: bool = False,
     report_path: str | Path | None = None,
+    begin: Callable[[ShotReport], None] | None = None,
     progress: ShotProgress | None = None,
     client: Client | None = None,
 ) -> ShotReport:
@@ -80,6 +81,8 @@ def fuse_shot(
         update: as ``skip_existing``, but fuse a frame again if an input is newer than its EXR, as ``make`` does.
         report_path: JSON file that is kept up to date frame by frame. With ``skip_existing``, skipped frames keep
             their entries of an earlier report.
+        begin: called before the first frame is fused with the report, whose ``found`` and ``temporal`` say what will be
+            done. It is not called if no frame is to be fused.
         progress: called after each frame with its result and the report so far. Frames that are skipped, missing or
             blocked by an existing file come first.
         client: a client of a Dask cluster that sees the same files, see
@@ -108,17 +111,24 @@ def fuse_shot(
     check_output(shot, inputs, model, [] if path is None else [path])
     with limit_threads(threads):
         plan = plan_temporal(shot, inputs, temporal, model, write)
-    settings = Settings(
-        inputs, write, model, device, threads, max_memory, view_transform, overwrite, skip_existing or update, update
-    )
+    skip, memory = skip_existing or update, bytes_of(max_memory)
+    settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update)
     report = ShotReport(shot, temporal=plan.text, neighbours=plan.count)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
     make_output(shot)
     running = _RunningReport(report, path, progress, start)
-    to_fuse = running.add_known(ExistingResults(settings, plan), earlier)
+    existing = ExistingResults(settings, plan)
+    if odd := existing.dated_in_future(shot.frames):
+        log.warning("%s: is dated in the future, so --update can't tell what is newer; set its date (touch)", odd)
+    to_fuse = running.add_known(existing, earlier)
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model))
+        report.found = look_ahead(to_fuse, settings)
+        if client is None and report.found is not None:
+            settings.session(report.found["scale"])  # a model that can't be used is refused before anything is told
+        if begin is not None:
+            begin(report)
     targets = [file for frame in shot.frames for file in (frame.output, frame.output.with_suffix(".png"))]
     remove_leftovers([*targets, *([] if path is None else [path])])
     try:

@@ -19,7 +19,7 @@ from oiio_msspl.jobs.sequence import FrameFiles, Shot
 
 #: The keys that are read of ``first_fused`` in an earlier report. If a report of another version lacks some of them,
 #: frames are compared with the first one that this run fuses.
-FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "scale", "model", "aovs", "layers", "notes", "passes"}
+FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "size", "scale", "model", "aovs", "layers", "notes", "passes"}
 
 #: The most layers that a warning names.
 MOST_NAMES = 6
@@ -54,7 +54,7 @@ class FrameResult:
     output: str = ""
 
 
-@dataclass
+@dataclass(repr=False)
 class ShotReport:
     """The results of a shot's frames."""
 
@@ -65,12 +65,20 @@ class ShotReport:
     """Entries of an earlier report about frames that are not in this run."""
     first: dict[str, Any] | None = None
     """The whole report of the first fused frame: scale, model and the layers that were read."""
+    found: dict[str, Any] | None = None
+    """What was found before the first frame: ``frame``, ``renderer``, ``scale``, ``model``, ``aovs``, ``notes``,
+    ``views`` and ``sets`` (layers by name) of the first pair that can be read."""
     seconds: float = 0.0
     """Wall time."""
     temporal: str = ""
     """A sentence on the neighbours that frames are averaged with, and how motion is known; empty if switched off."""
     neighbours: int = 0
     """Frames before and after a frame that it is averaged with."""
+
+    def __repr__(self) -> str:
+        """Return one line; :meth:`as_dict` has everything."""
+        counts = Counter(result.status for result in self.results.values())
+        return f"<{self.shot.output}: {', '.join(f'{counts[status]} {status}' for status in counts) or 'no frames'}>"
 
     @property
     def exit_code(self) -> int:
@@ -153,13 +161,14 @@ def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
 
 
 def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """Compare the features, the scale, the model and the number of neighbours."""
+    """Compare the features, the size, the scale, the model and the number of neighbours."""
     words = {"default": "not found", "absent": "not found"}
     before, now = (
         {row["feature"]: words.get(row["status"], row["status"]) for row in report["aovs"] if row["status"] != "unused"}
         for report in (first, here)
     )
     pairs = {feature: (now[feature], before[feature]) for feature in now if feature in before}
+    pairs["the frame"] = here["size"], first["size"]
     pairs["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
     if here["scale"] == first["scale"]:  # each scale has models of its own
         pairs["the model"] = here["model"], first["model"]
@@ -221,6 +230,8 @@ def read_earlier(
     """
     if path is None:
         return {}
+    if path.is_file() and not (overwrite or skip_existing):
+        raise InputError(f"{path}: exists; pass --skip-existing to go on with that run, or --overwrite to replace it")
     check_target(path, overwrite=overwrite or skip_existing)
     if not path.exists():
         return {}

@@ -29,6 +29,12 @@ def test_mistakes_in_a_mapping_file_are_named(tmp_path, text, message):
         read_map_file(tmp_path / "map.toml")
 
 
+def test_a_mapping_file_may_begin_with_a_byte_order_mark(tmp_path):
+    """Editors on Windows write it."""
+    (tmp_path / "map.toml").write_text('albedo = "paint"', encoding="utf-8-sig")
+    assert read_map_file(tmp_path / "map.toml") == {"albedo": "paint"}
+
+
 def test_files_that_a_mapping_names_do_not_depend_on_the_working_directory(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert parse_map_options(["albedo=a/b.exr"]) == {"albedo": f"file:{tmp_path}/a/b.exr"}
@@ -80,7 +86,10 @@ def test_a_forged_mapping_file_is_refused_by_a_short_sentence(tmp_path, text, me
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device that never ends")
-@pytest.mark.parametrize("path", ["/dev/zero", "/dev", "nothing.toml"])
-def test_what_is_no_file_is_no_mapping(path):
-    with pytest.raises(InputError, match="no such file"):
+@pytest.mark.parametrize(
+    ("path", "problem"),
+    [("/dev/zero", "is no ordinary file"), ("/dev", "is a folder"), ("nothing.toml", "no such file")],
+)
+def test_what_is_no_file_is_no_mapping(path, problem):
+    with pytest.raises(InputError, match=f"{problem}; name a TOML file"):
         read_map_file(path)

@@ -18,6 +18,15 @@ def test_integers_are_no_light(tmp_path):
         mapped(tmp_path, ids)
 
 
+def test_an_aov_of_integers_does_not_refuse_the_frame(tmp_path):
+    """Another layer is read in its place, if there is one."""
+    channels = layer("", 1) | {f"albedo.{c}": np.full((H, W), 4000, np.uint32) for c in "RGB"}
+    render = mapped(tmp_path, channels)
+    assert sources(render) == {"rgb": "R G B"}
+    assert render.notes == ["albedo: albedo holds integers (ids, not light), so it is not read"]
+    assert sources(mapped(tmp_path, channels | layer("basecolor", 2)))["albedo"] == "basecolor"
+
+
 def test_an_alpha_of_integers_is_none(tmp_path):
     render = mapped(tmp_path, layer("", 1) | {"A": np.ones((H, W), np.uint32)})
     assert render.alpha is None and [c.name for c in render.beauty_channels] == ["R", "G", "B"]
@@ -321,6 +330,12 @@ def test_a_channel_that_is_mapped_is_no_layer(tmp_path):
         mapped(tmp_path, channels, {"albedo": "Z"})
 
 
+def test_a_wrong_mapping_is_answered_with_what_is_there(tmp_path):
+    channels = layer("", 1) | layer("paint", 2) | layer("facing", 0, "XYZ") | {"mask.A": plane(1)}
+    with pytest.raises(InputError, match=r"albedo is mapped to pant, which is not there \(layers: facing, paint\)"):
+        mapped(tmp_path, channels, {"albedo": "pant"})
+
+
 def test_a_grayscale_file_has_no_beauty(tmp_path):
     with pytest.raises(InputError, match="no layer with R, G, B among: Y; write the beauty as RGB"):
         mapped(tmp_path, {"Y": plane(1)})
@@ -328,7 +343,7 @@ def test_a_grayscale_file_has_no_beauty(tmp_path):
 
 def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):
     channels = layer("", 1) | {"mask.A": plane(1)}
-    with pytest.raises(InputError, match="albedo is mapped to nothing, which is not there"):
+    with pytest.raises(InputError, match=r"albedo is mapped to nothing, which is not there$"):
         mapped(tmp_path, channels, {"albedo": "nothing"})
     with pytest.raises(InputError, match=r"layer 'mask' has channels A, not R, G, B"):
         mapped(tmp_path, channels, {"albedo": "mask"})

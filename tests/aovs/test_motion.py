@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which layers hold motion vectors, position and depth, by name."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from oiio_msspl.aovs.motion import MotionFormat, find_motion_layers
-from oiio_msspl.aovs.renderers import renderers
+from oiio_msspl.aovs import motion
+from oiio_msspl.aovs.motion import MOST_GUESSES, MotionFormat, find_motion_layers
+from oiio_msspl.aovs.renderers import renderers, view_layer_of
 from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.exr.layers import Layer, layers_of
-from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.reader import Channel, open_exr
 from tests.aovs.renders import H, W, layer, mapped
 from tests.conftest import write_exr
 
@@ -57,3 +60,20 @@ def test_position_and_depth_are_found(tmp_path, channels, position, depth):
     found = mapped(tmp_path, channels).motion
     assert (found.position and found.position[0].name) == position
     assert (found.depth and found.depth.name) == depth
+
+
+def test_layers_of_unknown_names_are_guesses_and_not_too_many(tmp_path):
+    """What is known or read is none, and layers of two channels come first."""
+    channels = layer("", 1) | layer("albedo", 1) | layer("light_key", 1) | layer("Crypto00", 1, "RGBA")
+    channels |= {c: p for i in range(20) for c, p in layer(f"paint{i}", 1).items()} | layer("shift", 1, "uv")
+    guesses = [field.name for field in mapped(tmp_path, channels).motion.guesses]
+    assert len(guesses) == MOST_GUESSES
+    assert guesses[0] == "shift.uv" and all(name.startswith("paint") for name in guesses[1:])
+
+
+def test_the_work_grows_with_the_number_of_layers_and_not_with_its_square(monkeypatch):
+    lamps = [Layer(f"lamp {i}", "", {c: Channel(Path(), 0, 3 * i, c, "half") for c in "RGB"}) for i in range(500)]
+    calls = []
+    monkeypatch.setattr(motion, "view_layer_of", lambda *names: calls.append(names) or view_layer_of(*names))
+    find_motion_layers(renderers()[-1], lamps, Beauty("", "", Layer("", "")))
+    assert 0 < len(calls) < 100 * len(lamps)

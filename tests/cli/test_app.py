@@ -10,6 +10,7 @@ import sysconfig
 
 import pytest
 
+from oiio_msspl import __version__
 from tests.programs import run
 
 
@@ -40,14 +41,14 @@ def test_installed_programs_are_on_the_path():
 SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --quality --device --max-memory --output --layout --layers --passes --error-layer "
-        "--overwrite --json --frames --temporal --skip-existing --help --help-all",
-        21,
+        "--overwrite --json --frames --temporal --skip-existing --help --help-all --version",
+        23,
     ),
     "msspl_render": (
         "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output "
         "--layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
-        "--help --help-all",
-        9,
+        "--help --help-all --version",
+        11,
     ),
 }
 
@@ -74,6 +75,12 @@ def test_help_shows_everyday_options_in_groups_and_help_all_shows_all(program):
         "Output",
         "Shot",
     ]
+
+
+@pytest.mark.parametrize("program", SHOWN)
+def test_programs_tell_their_version(program):
+    done = run(program, "--version")
+    assert (done.returncode, done.stdout) == (0, f"{__version__}\n")
 
 
 def test_help_all_of_submit_lists_the_options_of_msspl_fuse():

@@ -51,7 +51,7 @@ def test_a_closed_stream_is_no_fault(tmp_path, bilinear_models, closed):
         (("variance", "default", ""), "none (optional)"),
         (("normal", "found", "N"), "found: N"),
         (("diffuse", "computed", "a + b"), "computed: a + b (scaled)"),
-        (("variance", "unused", "v"), "found: v; this model does not read it"),
+        (("variance", "unused", "v"), "not read: v"),
         (("alpha", "absent", ""), "none"),
     ],
 )

@@ -152,7 +152,7 @@ def test_nothing_is_overwritten_without_being_told(files, bilinear_models):
         (["lr.exr", "hr.exr", "-o", "."], "is a folder"),
         (["lr.exr", "."], "is a folder"),
         (["lr.exr", "hr.exr", "--compression", "dwaa:x"], "use one of none"),
-        (["lr.exr", "hr.exr", "--view", "sepia"], "--view 'sepia'"),
+        (["lr.exr", "hr.exr", "--ocio-view", "sepia"], "--ocio-view 'sepia'"),
         (["lr.exr", "hr.exr", "-o", "hr.exr", "--overwrite"], "is one of the inputs"),
         (["lr.exr", "hr.exr", "-o", "out.png"], "the result is an EXR"),
     ],
@@ -204,7 +204,7 @@ def test_opencolorio_views_of_the_preview(files, bilinear_models):
         "--overwrite",
     ]
     pictures = []
-    for extra in ([], ["--view", "Un-tone-mapped"], ["--view", "ACES 1.0 - SDR Video"]):
+    for extra in ([], ["--ocio-view", "Un-tone-mapped"], ["--ocio-view", "ACES 1.0 - SDR Video"]):
         assert fuse(*arguments, *extra).returncode == 0
         pictures.append(np.asarray(oiio.ImageBuf(str(files / "out.png")).get_pixels(oiio.UINT8)).astype(int))
     assert np.abs(pictures[0] - pictures[1]).max() <= 2  # the paper's curve is sRGB, clipped at white

@@ -21,7 +21,7 @@ from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["lr/#.##.exr", "hr", "-o", "out"], "has its frame number in one place"),
+        (["lr/##.##.exr", "hr", "-o", "out"], "has its frame number in one place"),
         (["lr/x.####.exr", "hr", "-o", "out"], "no file has such a name; the folder has .*lr.####.exr"),
         (["no/x.####.exr", "hr", "-o", "out"], "there is no folder"),
         (["lr/lr.1001.exr", "hr", "-o", "out"], "is a single file, the other one is a folder"),
@@ -40,7 +40,7 @@ from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot
         (["lr", "hr", "-o", "out", "--progress", "json", "--json"], "both print to standard output"),
         (["lr", "hr", "-o", "out", "--report", "no/r.json"], "does not exist; create it first"),
         (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
-        (["lr", "hr", "-o", "out", "--view", "x"], "--view 'x'"),
+        (["lr", "hr", "-o", "out", "--ocio-view", "x"], "--ocio-view 'x'"),
         (["lr", "hr", "-o", "out", "--model", "paper", "--error-layer"], "paper-x4 does not predict its error"),
         (["lr/lr.1001.exr", "hr/beauty.1001.exr", "-o", "o.exr", "--skip-existing"], "--skip-existing is for shots"),
     ],

@@ -2,6 +2,7 @@
 """msspl inspect, as a process."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -42,14 +43,31 @@ def test_inspect_lists_only_what_the_model_reads(files):
     table = said["joint"].partition("  what joint would read:\n")[2]
     assert [line.split()[0] for line in table.splitlines()[:4]] == ["rgb", "albedo", "normal", "alpha"]
     assert "  neither read nor fused: diffuse, variance\n" in table
-    assert "variance" not in said["joint"].replace(table, "")
+    assert "variance" not in said["joint"].partition("  layers:\n")[0]
     assert "diffuse   found: diffuse\n" in said["paper"]
     assert "specular  none (optional)\n" in said["paper"]
     assert "variance: 64 values are negative; fusing sets them to 0\n" in said["paper"]
     for text in said.values():
         assert "none: expect blur, render an albedo (or name it with --map albedo=LAYER)\n" in text
     mapped = run("msspl", "inspect", files / "more.exr", "--model", "joint", "--map", "specular=diffuse").stdout
-    assert "specular  found: diffuse; this model does not read it\n" in mapped
+    assert "specular  not read: diffuse\n" in mapped
+
+
+def test_inspect_lists_all_layers_and_says_that_a_file_is_a_result(files):
+    made = run("msspl_fuse", files / "lr.exr", files / "hr.exr", "-o", files / "made.exr", "--quality", "fast")
+    assert made.returncode == 0, made.stderr
+    said = run("msspl", "inspect", files / "made.exr").stdout
+    assert f"a result, fused with joint-small-x4 from {files}/lr.exr and {files}/hr.exr\n" in said
+    assert re.search(r"\n    mask +X +half ", said)
+    data = json.loads(run("msspl", "inspect", files / "hr.exr", "--json").stdout)
+    assert {row["layer"]: row["channels"] for row in data["layers"]}["mask"] == "X"
+    assert not any("result" in fact for fact in data["facts"])
+
+
+def test_inspect_names_layers_that_may_hold_vectors(files):
+    still = np.zeros((8, 8), np.float32)
+    write_exr(files / "moving.exr", rgb(picture(8, 8)) | {"motion.X": still, "motion.Y": still})
+    assert "motion: motion.XY may hold vectors" in run("msspl", "inspect", files / "moving.exr").stdout
 
 
 def test_inspect_keeps_notes_on_a_variance_for_the_model_that_reads_it(files):

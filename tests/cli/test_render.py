@@ -10,10 +10,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from msspl_cli.blender_process import command, find_blender
-from msspl_cli.commands.render import name_targets
+from msspl_cli.commands.render import _Printer, name_targets
 from msspl_cli.installed import shipped_folder
 
 from oiio_msspl.errors import InputError
@@ -243,6 +244,7 @@ def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, 
         shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))
     assert [list(frame.vectors) for frame in loaded] == [[1]] * 3
     assert counted and all(counted)
+    assert open_exr(tmp_path / "1002.exr").metadata["msspl/hrls"] == "a render that was not kept"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1001.exr", "1002.exr", "1003.exr"]
 
 
@@ -515,3 +517,20 @@ def test_a_blender_that_ends_while_its_frame_is_fused_is_named(farm, model):
     assert crash != ASKS
     code, _, err, _ = run("--model", model, code=crash)
     assert code == 1 and "ended with code 3" in err
+
+
+def test_the_bar_covers_the_whole_run(monkeypatch):
+    """It grows from frame to frame, and each render is a third of a frame."""
+    told = []
+    shot = SimpleNamespace(order=[1, 2], waits=lambda output: True)
+    printer = _Printer(shot, quiet=False, verbose=False, keep=False)
+    monkeypatch.setattr(printer._bar, "update", lambda label, done, total: told.append((label, done / total)))
+    for frame in (1, 2):
+        for step, fraction in (("LRHS", 0.0), ("HRLS", 1 / 3), ("fuse", 2 / 3)):
+            printer.show({"frame": frame, "step": step, "fraction": fraction})
+            if step != "fuse":
+                printer.show({"samples": 0.5})
+        printer.show({"report": {"output": "out.exr"}})
+    shares = [share for _, share in told]
+    assert shares == pytest.approx([k / 12 for k in (0, 1, 2, 3, 4, 6, 7, 8, 9, 10)])
+    assert told[-1][0] == "frame 2: fuse"

@@ -45,6 +45,7 @@ from tests.shots import HEIGHT, WIDTH, layers, make_shot
         (["hr", "lr", "-o", "out"], "swapped"),
         (["lr", "hr", "-o", "out", "--map", "albedo=nope"], "albedo is mapped to nope, which is not there"),
         (["lr", "hr", "-o", "out", "--model", "joint-x8"], "model joint-x8 is for x8, but this pair is x"),
+        (["lr", "hr", "-o", "out", "--chunk", "99999999999"], "--chunk"),
         (["lr", "hr", "-o", "out", "--colour"], "No such option"),
         (["lr", "hr"], "Missing option"),
         (["lr", "hr", "-o", "out", "--bundle", "hr"], "hr: exists; name a new folder"),

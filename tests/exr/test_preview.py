@@ -73,7 +73,7 @@ def test_our_previews_are_told_from_other_pictures(tmp_path):
 
 def test_an_unknown_view_is_refused_with_those_that_exist(tmp_path):
     check_view("Un-tone-mapped")
-    with pytest.raises(InputError, match=r"--view 'sepia': .* has .*Un-tone-mapped"):
+    with pytest.raises(InputError, match=r"--ocio-view 'sepia': .* has .*Un-tone-mapped"):
         check_view("sepia")
 
 

@@ -14,12 +14,16 @@ import pytest
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr import part_specs
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
 from oiio_msspl.exr.writer import bytes_held, write_fused
 from tests.conftest import picture, read_bits, rgb, same_bits, write_exr
 from tests.exr.sources import SOURCES, H, W, behind_a_deep_part, everything, flat, plain, stereo, written
+
+#: Compressions that the OpenEXR of this machine may be too old for.
+NEW = [name for name in ("htj2k256", "htj2k32", "zstd", "lj2k") if hasattr(OpenEXR, f"{name.upper()}_COMPRESSION")]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -283,7 +287,7 @@ def test_long_metadata_is_not_multiplied(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["half", "float"])
-@pytest.mark.parametrize("compression", ["none", "zips", "piz", "dwaa"])
+@pytest.mark.parametrize("compression", ["none", "zips", "piz", "dwaa", *NEW])
 def test_pixel_type_and_compression_of_the_beauty(tmp_path, kind, compression):
     source = everything()
     _, out, parts = written(tmp_path, source, WriteOptions(pixel_type=kind, compression=compression))
@@ -485,3 +489,33 @@ def test_an_alpha_of_integers_is_passed_on(tmp_path, layout):
     _, _, after = written(tmp_path, rgb(picture(H, W)) | {"A": ids}, WriteOptions(layout))
     (plane,) = [planes["A"] for _, planes in after if "A" in planes]
     assert same_bits(plane, ids)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_part_keeps_the_colour_space(tmp_path, layout):
+    """A part that is split into layers tells their space once, and programs read part by part."""
+    channels = rgb(picture(H, W)) | rgb(picture(H, W), "light_1.")
+    written(tmp_path, channels, WriteOptions(layout), colorInteropID="lin_ap1_scene")
+    with OpenEXR.File(str(tmp_path / "out.exr"), header_only=True) as out:
+        assert [part.header.get("colorInteropID") for part in out.parts] == ["lin_ap1_scene"] * len(out.parts)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("compression", NEW)
+def test_compressions_of_new_versions_are_kept(tmp_path, compression, layout):
+    """All but lj2k, which changes colours, are kept bit for bit in every part."""
+    method = getattr(OpenEXR, f"{compression.upper()}_COMPRESSION")
+    before = everything()
+    _, out, after = written(tmp_path, before, WriteOptions(layout), compression=method)
+    kept = "zip" if compression == "lj2k" else compression
+    assert {part.compression for part in open_exr(out).parts} == {kept}
+    if compression != "lj2k":
+        assert same_bits(flat(after)["crypto00", "R"], before["crypto00.R"])
+
+
+def test_a_compression_that_the_library_lacks_is_refused(tmp_path, monkeypatch):
+    """OpenImageIO would write zip without a word."""
+    monkeypatch.setattr(part_specs, "_compress", lambda spec, name: spec.attribute("compression", "future"))
+    with pytest.raises(InputError, match="--compression zips: this OpenImageIO writes zip instead; name another one"):
+        written(tmp_path, everything(), WriteOptions(compression="zips"))
+    assert not (tmp_path / "out.exr").exists()

@@ -67,6 +67,14 @@ def test_chromaticities_of_a_header_win_over_names():
     assert space_of({"chromaticities": own}).chromaticities == own
 
 
+def test_the_interop_id_wins_over_stale_chromaticities():
+    """A program that converts colours sets the ID, and often keeps the chromaticities of its source."""
+    header = {"chromaticities": tuple(map(float, REC709.chromaticities)), "oiio:ColorSpace": "lin_ap1_scene"}
+    assert space_of(header | {"colorInteropID": "lin_ap1_scene"}) == ACESCG
+    assert space_of(header | {"colorInteropID": "unknown"}) == REC709
+    assert space_of({"colorInteropID": "lin_adobergb_scene"}).name == "lin_adobergb"
+
+
 @pytest.mark.parametrize("values", [(0.0,) * 8, (float("nan"),) * 8, (0.3, 0.3) * 4, (1.0,), "8 letters", None])
 def test_chromaticities_that_mean_nothing_are_ignored(values):
     assert space_of({"chromaticities": values}) is None

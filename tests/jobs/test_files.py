@@ -44,8 +44,17 @@ def test_the_result_is_written_over_the_hrls_s_data_window(pair, tmp_path, bilin
     )
     beauty = open_exr(report.output).parts[0]
     assert beauty.data_window.size == f"{WIDTH}x{HEIGHT}"
-    assert done[-1] == (report.tiles, report.tiles)
+    assert (done[0], done[-1]) == ((0, 1000), (1000, 1000))
     assert set(report.seconds) == {"read", "fuse", "network", "write"}
+
+
+def test_python_takes_what_people_write(pair, tmp_path, bilinear_models):
+    """And a report that is printed is one line."""
+    report = fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), max_memory="2G", preview_path=True)
+    assert report.preview == tmp_path / "out.png" and report.preview.exists()
+    assert str(report) == f"<{tmp_path}/out.exr, fused at x4 with bilinear-x4, {len(report.warnings)} warnings>"
+    with pytest.raises(InputError, match="'much'"):
+        fuse_files(*pair, tmp_path / "more.exr", max_memory="much")
 
 
 @pytest.mark.parametrize(

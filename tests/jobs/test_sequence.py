@@ -36,17 +36,19 @@ def test_every_way_to_write_a_pattern_means_the_same_files(tmp_path, pattern):
     assert found.frames[1].output == tmp_path / "a.0007.exr"
 
 
-@pytest.mark.parametrize("name", ["still@2x.exr", "me@home.exr", "100%done.exr", "a.exr"])
+@pytest.mark.parametrize("name", ["still@2x.exr", "me@home.exr", "100%done.exr", "a.exr", "take#2.exr", "#a.exr"])
 def test_ordinary_names_are_no_patterns(tmp_path, name):
     assert not is_sequence(tmp_path / name)
     longer = name.replace(".exr", ".####.exr")
     assert parse_pattern(tmp_path / longer).path(7).name == name.replace(".exr", ".0007.exr")
 
 
-@pytest.mark.parametrize("name", ["a.@.exr", "@.exr", "a_@-b.exr", "a%d.exr", "a.%d_lr.exr", "%d"])
+@pytest.mark.parametrize(
+    "name", ["a.@.exr", "@.exr", "a_@-b.exr", "a%d.exr", "a.%d_lr.exr", "%d", "a#.exr", "a.#_lr.exr"]
+)
 def test_the_shortest_patterns_are_of_one_digit(tmp_path, name):
     assert is_sequence(tmp_path / name)
-    assert parse_pattern(tmp_path / name).path(7).name == name.replace("@", "7").replace("%d", "7")
+    assert parse_pattern(tmp_path / name).path(7).name == re.sub("[@#]|%d", "7", name)
 
 
 def test_folders_pair_by_number_whatever_names_and_padding(tmp_path):
@@ -233,8 +235,10 @@ def test_the_frame_number_in_a_name_is_no_version(tmp_path, name, following):
 
 def test_a_number_in_the_name_of_a_new_folder_is_explained(tmp_path):
     touch(tmp_path, "lr.1.exr", "hr.1.exr")
-    with pytest.raises(InputError, match=r"take#2: # stands for the frame number, and the results are EXRs; name them"):
-        find_shot(tmp_path / "lr.#.exr", tmp_path / "hr.#.exr", tmp_path / "take#2")
+    with pytest.raises(
+        InputError, match=r"take##2: ## stands for the frame number, and the results are EXRs; name them"
+    ):
+        find_shot(tmp_path / "lr.#.exr", tmp_path / "hr.#.exr", tmp_path / "take##2")
 
 
 def test_versions_in_a_folder_are_no_frames(tmp_path):
@@ -248,3 +252,22 @@ def test_versions_in_a_folder_are_no_frames(tmp_path):
     touch(tmp_path / "lr", "rev1.exr")
     touch(tmp_path / "hr", "rev1.exr")
     assert list(find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out").hr.files) == [1]
+
+
+def test_where_aovs_have_files_of_their_own_the_beauty_is_paired(tmp_path):
+    names = [f"shot_{word}.{n}.exr" for word in ("beauty", "albedo", "depth") for n in (1, 2)]
+    touch(tmp_path / "lr", *names)
+    touch(tmp_path / "hr", *names)
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert (found.lr.pattern.name, found.hr.pattern.name) == ("shot_beauty.#.exr",) * 2
+
+
+def test_sub_frames_are_no_frames(tmp_path):
+    """Renderers write them between whole frames, for motion blur. A number without its frame may be a version."""
+    for side in ("lr", "hr"):
+        touch(tmp_path / side, "a.1001.exr", "a.1001.50.exr", "a.1002.exr", "a.1002.25.exr", "a.1002.75.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert [frame.hr.name for frame in found.frames] == ["a.1001.exr", "a.1002.exr"]
+    touch(tmp_path / "versions", "a.2.0001.exr", "a.2.0002.exr")
+    found = find_shot(tmp_path / "versions", tmp_path / "versions", tmp_path / "out")
+    assert [frame.number for frame in found.frames] == [1, 2]

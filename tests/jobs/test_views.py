@@ -9,10 +9,11 @@ import pytest
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_shot
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.inspection import inspect_file
-from oiio_msspl.jobs import run
+from oiio_msspl.jobs import files, run
 from oiio_msspl.jobs.inputs import map_pair
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.views import find_other_views
+from oiio_msspl.jobs.write import write_settled
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 
 HEIGHT, WIDTH = 64, 96
@@ -299,13 +300,17 @@ def test_check_and_inspect_look_at_all_views(tmp_path):
     assert inspect_file(pair[1], InputOptions(view="fg")).other_views == []
 
 
-def test_progress_counts_the_tiles_and_the_passes_of_all_views(tmp_path, bilinear_models):
-    pair = write_layers(tmp_path)
-    told = []
-    fused(pair, tmp_path / "out.exr", bilinear_models, progress=lambda done, count: told.append((done, count)))
-    assert told[-1] == (4, 4)  # for each view one tile, and one band of one set
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
-    assert {count for _, count in told} == {4}
+def test_progress_covers_the_tiles_and_the_passes_of_all_views_and_writing(tmp_path, bilinear_models, monkeypatch):
+    pair, told = write_layers(tmp_path), []
+    monkeypatch.setattr(
+        files, "write_settled", lambda *args, **more: told.append("write") or write_settled(*args, **more)
+    )
+    fused(pair, tmp_path / "out.exr", bilinear_models, progress=lambda done, count: told.append(done / count))
+    at = told.index("write")
+    shares = told[:at] + told[at + 1 :]
+    # For each view one tile, and one band of one set.
+    assert len(set(shares)) >= 6 and shares == sorted(shares)
+    assert (shares[0], told[-1]) == (0, 1) and 0.5 < told[at - 1] < 1
 
 
 def test_a_report_tells_the_tiles_of_each_view(tmp_path, bilinear_models):

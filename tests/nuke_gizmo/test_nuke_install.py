@@ -47,8 +47,10 @@ def test_one_working_line_is_added_and_taken_out_again(install, tmp_path, monkey
 
 
 def test_another_folder_gets_the_line_and_a_missing_one_is_refused(install, tmp_path):
+    (tmp_path / "site").mkdir()
     assert install("--dir", tmp_path / "site").returncode == 0
     assert "pluginAddPath" in (tmp_path / "site" / "init.py").read_text()
-    done = install("--dir", tmp_path / "not" / "there")
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {tmp_path}/not/there: there is no folder {tmp_path}/not")
+    done = install("--dir", tmp_path / "typo")
+    assert done.returncode == 2 and not (tmp_path / "typo").exists()
+    assert done.stderr.startswith(f"error: {tmp_path}/typo: no such folder; make it, or name another one with --dir")
+    assert install().returncode == 0  # Nuke's own folder is made

@@ -63,7 +63,7 @@ _LAYERS = (
     "Write only these layers of HR (crypto*) beside the beauty, or none. A pass that does not match is left out, too. "
     "May be repeated. \\[default: all]"
 )
-_COMPRESSION = "Compress the fused layer by zip, zips, piz, dwaa, ... \\[default: as HR]"
+_COMPRESSION = "Compress the fused layer by zip, htj2k256, dwaa, ... \\[default: as HR, or zip if that is lossy]"
 
 
 def fuse(
@@ -103,7 +103,9 @@ def fuse(
         bool | None, option(OUTPUT, "Set the fused layer's type. \\[default: as HR]", "--half/--float", hidden=True)
     ] = None,
     preview: Annotated[bool, option(OUTPUT, "Write an sRGB PNG beside OUT.", hidden=True)] = True,
-    view: Annotated[str | None, option(OUTPUT, "Preview in an OpenColorIO view.", metavar="VIEW", hidden=True)] = None,
+    view: Annotated[
+        str | None, option(OUTPUT, "Preview in an OpenColorIO view.", "--ocio-view", metavar="NAME", hidden=True)
+    ] = None,
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     # Shot
@@ -129,6 +131,7 @@ def fuse(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
+    version: options.Version = False,
 ) -> None:
     """Remove the noise of a render, or of two renders of the same frame together.
 
@@ -146,6 +149,7 @@ def fuse(
     from oiio_msspl.exr.reader import use_threads
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import check_exists, is_sequence
+    from oiio_msspl.jobs.settings import bytes_of
 
     lr, hr = options.low_and_high(renders)
     for path in renders:
@@ -158,7 +162,7 @@ def fuse(
         "model": options.choose_model(model, quality),
         "device": device,
         "threads": threads,
-        "max_memory": options.parse_bytes(max_memory),
+        "max_memory": bytes_of(max_memory),
         "view_transform": view,
         "overwrite": overwrite,
     }
@@ -199,7 +203,7 @@ def _fuse_shot(files: Files, scheduler: str | None, printer: ShotPrinter, **sett
         cluster = connect(scheduler)
     try:
         with cluster as client:
-            report = fuse_shot(*files, progress=printer, client=client, **settings)
+            report = fuse_shot(*files, begin=printer.begin, progress=printer, client=client, **settings)
     finally:
         printer.end()
     raise typer.Exit(report.exit_code)
@@ -212,11 +216,11 @@ def _fuse_pair(files: Files, verbose: int, quiet: bool, as_json: bool, **setting
     start = time.perf_counter()
     with console.ProgressBar(shown=not quiet and not verbose) as bar:
 
-        def show_tile(done: int, count: int) -> None:
-            logging.info("step %d of %d", done, count)
+        def show(done: int, count: int) -> None:
+            logging.info("step %d of %d", done, count)  # hosts read this line
             bar.update("fusing", done, count)
 
-        report = fuse_files(*files, progress=show_tile, **settings)
+        report = fuse_files(*files, progress=show, **settings)
     if as_json:
         print(json.dumps(report.as_dict(), indent=2))
     elif not quiet:

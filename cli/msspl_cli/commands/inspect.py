@@ -52,6 +52,11 @@ def inspect(
             console.say(str(inspection.path))
             for line in inspection.facts:
                 console.say(f"  {line}")
+            if inspection.layers:
+                console.say("  layers:")
+                several = len({row["part"] for row in inspection.layers}) > 1
+                keys = ("layer", "view", "channels", "type", *(["part"] if several else []))
+                console.table([[row[key] for key in keys] for row in inspection.layers], indent=4)
             if inspection.render is not None:
                 console.say(f"  what {inspection.model} would read:")
                 console.aov_table(inspection.aovs(), inspection.render.notes)

@@ -65,10 +65,11 @@ def set_line(path: Path, line: str | None) -> bool:
         Whether the file changed.
 
     Raises:
-        InputError: the folder's parent is missing, or the file can't be read.
+        InputError: the folder is missing, or the file can't be read.
     """
-    if not path.parent.parent.is_dir():
-        raise InputError(f"{path.parent}: there is no folder {path.parent.parent}; name Nuke's folder with --dir")
+    # Nuke makes ~/.nuke when it starts for the first time. Another folder may be a slip.
+    if not path.parent.is_dir() and (path.parent.name != ".nuke" or not path.parent.parent.is_dir()):
+        raise InputError(f"{path.parent}: no such folder; make it, or name another one with --dir")
     try:
         before = path.read_bytes() if path.exists() else b""
     except OSError as error:

@@ -100,6 +100,7 @@ def render(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
+    version: options.Version = False,
 ) -> None:
     """Render a Blender scene at low and at full resolution, and fuse the two.
 
@@ -112,7 +113,7 @@ def render(
     from oiio_msspl.jobs.blender_source import RenderedShot, beside
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import FrameFiles
-    from oiio_msspl.jobs.settings import Settings
+    from oiio_msspl.jobs.settings import Settings, bytes_of
     from oiio_msspl.model.contract import SCALES
 
     for name, value, choices in (("--scale", scale, SCALES), ("--filter", pixel_filter, ("box", "scene"))):
@@ -136,7 +137,7 @@ def render(
         model=options.choose_model(model, quality),
         device=device,
         threads=threads,
-        max_memory=options.parse_bytes(max_memory),
+        max_memory=bytes_of(max_memory),
         overwrite=overwrite,
     )
     # A scene without a number is one frame, numbered 0.
@@ -236,6 +237,8 @@ class _Printer:
     def __init__(self, shot: RenderedShot, quiet: bool, *, verbose: bool, keep: bool) -> None:
         self._shot, self._quiet, self._keep = shot, quiet, keep
         self._bar, self._label = console.ProgressBar(shown=not quiet and not verbose), ""
+        #: Frames that are done, and the fraction of the current one that is done.
+        self._done, self._fraction = 0, 0.0
         self._reports: list[dict[str, Any]] = []
         self._waiting: list[dict[str, Any]] = []  # reports of frames that wait for their neighbours
         self._warnings: list[str] = []  # about all frames
@@ -247,10 +250,13 @@ class _Printer:
         if "step" in event:
             number = event.get("frame")
             self._label = event["step"] if number is None else f"frame {number}: {event['step']}"
+            self._fraction = event.get("fraction", 0.0)
         if "report" in event:
             self._waiting.append(event["report"])
-        else:
-            self._bar.update(self._label, event.get("samples", 0), 1)
+            self._done, self._fraction = self._done + 1, 0.0
+        else:  # each render is a third of the work
+            done = self._done + self._fraction + event.get("samples", 0) / 3
+            self._bar.update(self._label, done, len(self._shot.order))
         self._add_written()
 
     def _add_written(self) -> None:

@@ -38,9 +38,12 @@ _PATHS = ("output", "map_file")
 def submit(
     context: typer.Context,
     bundle: Annotated[Path, typer.Option(metavar="DIR", help="Write to this new folder.", show_default=False)],
-    chunk: Annotated[int, typer.Option(metavar="N", min=1, help="Fuse N frames in each task.")] = 10,
+    chunk: Annotated[int, typer.Option(metavar="N", min=1, max=100_000, help="Fuse N frames in each task.")] = 10,
     timeout: Annotated[
-        int, typer.Option(metavar="SECONDS", min=1, help="Limit the time of a frame. A task gets N times as long.")
+        int,
+        typer.Option(
+            metavar="SECONDS", min=1, max=1_000_000, help="Limit the time of a frame. A task gets N times as long."
+        ),
     ] = 1800,
     # Typer splits a short option that it does not know into letters: in -o/path it would find the -h of --help.
     output: Annotated[str | None, typer.Option("--output", "-o", metavar="OUT", hidden=True)] = None,
@@ -67,6 +70,7 @@ def submit(
     from oiio_msspl.jobs.farm.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import format_frames
+    from oiio_msspl.jobs.settings import bytes_of
 
     # A wrong value is refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
@@ -75,7 +79,7 @@ def submit(
     added = ("error_layer", "frames_layer", "trust_layer", "data_passes")
     write = options.make_write_options(**{name: given[name] for name in (*written, *added)})
     temporal = TemporalOptions(given["temporal"], given["motion_format"])
-    max_memory = options.parse_bytes(given["max_memory"])
+    max_memory = bytes_of(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
     settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view")}
     settings |= {"inputs": inputs, "model": model, "options": passed_on, "chunk": chunk, "timeout": timeout}

@@ -224,19 +224,26 @@ def _find(
     if not frames.window.width or not frames.window.height:
         return MotionSource(NONE, f"its data window and that of {second.name} have no common part")
     fields = first.motion.fields if wanted is None else user_fields(first.motion, wanted, first.name)
-    stored = in_parallel(*(partial(_stored, frames, index, fields) for index in (0, 1)))
-    checks = [
-        _check(frames, field, stored[0].get(field.name), stored[1].get(field.name), verified.get(field.name))
-        for field in fields
-    ]
-    # To the next frame, and to the previous one.
-    each_way = {check.field.format.hop: check for check in reversed(checks) if not check.problem}
-    if each_way:
-        return _by_vectors([check for check in checks if check in each_way.values()])
+    checks = _checks(frames, fields, verified)
+    # Layers of which nothing is known count only if the pixels show that they are vectors.
+    for tried in (checks, *([_checks(frames, first.motion.guesses, verified)] if wanted is None else ())):
+        # To the next frame, and to the previous one.
+        each_way = {check.field.format.hop: check for check in reversed(tried) if not check.problem}
+        if each_way:
+            return _by_vectors([check for check in tried if check in each_way.values()])
     source = _without_vectors(frames, checks)
     if wanted is not None and source.kind != STATIC:
         raise InputError(f"--motion-format {wanted!r} does not fit {first.name}: {_problems(checks)}")
     return source
+
+
+def _checks(frames: TwoFrames, fields: Sequence[MotionField], verified: Mapping[str, MotionField]) -> list[FieldCheck]:
+    """Verify layers by the pixels of both frames."""
+    stored = in_parallel(*(partial(_stored, frames, index, fields) for index in (0, 1)))
+    return [
+        _check(frames, field, stored[0].get(field.name), stored[1].get(field.name), verified.get(field.name))
+        for field in fields
+    ]
 
 
 def _check(
@@ -294,7 +301,9 @@ def _without_vectors(frames: TwoFrames, checks: Sequence[FieldCheck]) -> MotionS
         if unclear := [check for check in checks if not check.zero]:
             rest = f"; what moves is not followed: {_problems(unclear)} (describe it with --motion-format)"
         return MotionSource(STATIC, f"the camera stands still{rest}", tuple(check.field for check in checks))
-    seen = f"{_problems(checks)}; " if checks else "no motion vectors; "
+    guesses = ", ".join(field.name for field in frames.first.motion.guesses)
+    unknown = f" (by the pixels {guesses} holds none)" if guesses else ""
+    seen = f"{_problems(checks)}; " if checks else f"no motion vectors{unknown}; "
     if checks and all(check.zero for check in checks) and moved.any():
         seen = f"{_problems(checks)}, though the picture moves (Cycles writes zeros if motion blur is on); "
     if projection := find_projection(frames):

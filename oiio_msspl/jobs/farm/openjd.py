@@ -107,7 +107,7 @@ def make_job(
         raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
     if view is not None:
         check_view(view)
-    options = [*(["--device", device] if device != "cpu" else []), *(["--view", view] if view else []), *options]
+    options = [*(["--device", device] if device != "cpu" else []), *(["--ocio-view", view] if view else []), *options]
     files = {"--map-file": map_file} if map_file else {}
     shot = find_shot(lr, hr, output, frames)
     # The job names its model: a worker with another version, which would choose another family, then refuses the frame.

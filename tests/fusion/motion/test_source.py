@@ -600,3 +600,18 @@ def test_without_layers_that_tell_no_object_is_found(tmp_path, size):
     still, known = np.zeros((height, width, 2), np.float32), np.ones((height, width), bool)
     assert not MotionSource("static", "").moved_objects(*pair, still, known).any()
     assert MotionSource("vectors", "").moved_objects(*pair, still, known) is None
+
+
+def test_a_layer_of_an_unknown_name_is_told_by_the_pixels(tmp_path):
+    """Unknown layers that are no vectors do no harm, and are named."""
+    form = MotionFormat("previous", y="up")
+    frames = shot(tmp_path, form, "motion")
+    assert not frames[0].motion.fields and [field.name for field in frames[0].motion.guesses] == ["motion.XY"]
+    source = find_motion(frames[0], frames[1])
+    assert (source.kind, source.fields[0].name) == ("vectors", "motion.XY")
+    assert right_share(source, frames, 1, -1) > 0.8
+    (tmp_path / "other").mkdir()
+    frames = shot(tmp_path / "other", form, "wear", change=lambda values: np.sqrt(np.abs(values)) % 1)
+    source = find_motion(frames[0], frames[1])
+    assert "motion vectors (by the pixels wear.XY holds none); " in source.text
+    assert source.text.startswith("no ")

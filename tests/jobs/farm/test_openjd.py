@@ -103,7 +103,7 @@ def averaged(tmp_path_factory, bilinear_models):
     options = ("--model", bilinear_models[4], "--no-preview")
     done = fuse(folder / "lr", folder / "hr", "-o", folder / "local", *options)
     assert done.returncode == 0, done.stderr
-    assert "Fused with 4 frames before and after each: motion vectors" in done.stdout
+    assert "Fuses with 4 frames before and after each: motion vectors" in done.stdout
     return folder
 
 

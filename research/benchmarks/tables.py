@@ -21,7 +21,7 @@ from typing import Any
 
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SPREAD
-from research.benchmarks import paper, passes, results, runtime
+from research.benchmarks import detail, paper, passes, results, runtime
 from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label
 from research.benchmarks.results import MEAN, Row
 from research.benchmarks.runtime import SAME_WORK
@@ -148,6 +148,23 @@ SAMPLE_COUNTS = Table(
             renamed={m: f"{m}, {more}:{less}" for m in METHODS if more > 1},
         )
         for spp, more, less in ((4, 1, 1), (4, 3, 1), (8, 1, 1), (8, 3, 1), (8, 7, 1))
+    ],
+)
+
+DETAIL = Table(
+    ("detail",),
+    detail.KEYS,
+    ("case",),
+    ("case",),
+    [
+        Column(f"{spp}: {title}", "psnr", {"spp": spp, "method": method}, form="{:.1f}")
+        for spp in ("4-1", "64-16", "256-64")
+        for method, title in {
+            "HRLS": "HRLS",
+            "OIDN prefiltered on the HRLS": "OIDN",
+            BEST + detail.NETWORK_ALONE: "`best`, network alone",
+            BEST: "`best`",
+        }.items()
     ],
 )
 
@@ -327,6 +344,7 @@ TABLES: dict[Path, dict[str, Block]] = {
     ROOT / "docs/design/results.md": {
         "accuracy_by_scene": ACCURACY_BY_SCENE,
         "how_sure": HOW_SURE,
+        "detail": DETAIL,
         "sample_counts": SAMPLE_COUNTS,
         "spread_noise": SPREAD_NOISE,
         "filters": FILTERS,

@@ -158,7 +158,8 @@ def _trust_in_points(energy: Array, noise: Array, darker: Mask, most: np.float32
     share = agreed / (total + np.float32(DOUBT / (2 * size + 1) ** 2))
     scattered = np.clip((share - AGREED[0]) / (AGREED[1] - AGREED[0]), 0, 1)
     alone = _kept(light, np.float32(ALONE) * max_around(noise, size))
-    return np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
+    is_point = energy > np.float32(POINT)
+    return is_point * np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
 
 
 def _certainty(excess: Array, squares: Array, size: int, certain: float) -> Array:

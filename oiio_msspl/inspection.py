@@ -176,14 +176,14 @@ def inspect_file(
 
 
 def inspect_noise(inspections: Sequence[Inspection]) -> None:
-    """Add to the larger of a frame's two renders the fact whether the pixel filter has spread their noise.
+    """Add to a render, or to the larger of a frame's two, the fact whether the pixel filter has spread the noise.
 
-    Nothing is added if the files are not such a pair.
+    Nothing is added if there are more files, or the two are no pair.
     """
     renders = [(inspection.render, inspection) for inspection in inspections if inspection.render is not None]
-    if len(renders) != 2:
+    if len(renders) not in (1, 2) or len(renders) < len(inspections):
         return
-    (lr, low), (hr, high) = sorted(renders, key=lambda pair: pair[0].display_window.width)
+    (lr, low), (hr, high) = sorted(2 * renders if len(renders) == 1 else renders, key=_width)
     try:
         spread = is_noise_spread(lr, hr, align(lr, hr))
     except InputError:
@@ -192,7 +192,12 @@ def inspect_noise(inspections: Sequence[Inspection]) -> None:
         return
     high.noise = "spread" if spread else "independent"
     text = "the pixel filter has spread it over neighbouring pixels" if spread else "independent in each pixel"
-    high.facts.append(f"noise, compared with {low.path.name}: {text}")
+    compared = "" if low is high else f", compared with {low.path.name}"
+    high.facts.append(f"noise{compared}: {text}")
+
+
+def _width(pair: tuple[MappedRender, Inspection]) -> int:
+    return pair[0].display_window.width
 
 
 def _look_at_sets(result: Inspection, render: MappedRender) -> list[str]:

@@ -23,6 +23,7 @@ from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SPREAD
 from research.benchmarks import detail, paper, passes, results, runtime
 from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label
+from research.benchmarks.one_size import SEEDS
 from research.benchmarks.results import MEAN, Row
 from research.benchmarks.runtime import SAME_WORK
 from research.benchmarks.scenes import NOISY_REFERENCE
@@ -338,11 +339,38 @@ CONFIDENCE = Table(
     ],
 )
 
+#: What a method of :mod:`research.benchmarks.one_size` gets, and its title.
+INPUTS = {
+    "OIDN": ("one render", "OIDN"),
+    "OIDN prefiltered": ("one render", "OIDN, prefiltered"),
+    "joint-x1": ("one render", "`--quality balanced`"),
+    "joint-large-x1": ("one render", "`--quality best`"),
+    "joint-x2": ("two sizes", "`--quality balanced`"),
+    "joint-large-x2": ("two sizes", "`--quality best`"),
+    f"OIDN{SEEDS}": ("two seeds", "OIDN on their mean"),
+    f"OIDN prefiltered{SEEDS}": ("two seeds", "OIDN on their mean, prefiltered"),
+    f"joint-x1{SEEDS}": ("two seeds", "`--quality balanced`"),
+    f"joint-large-x1{SEEDS}": ("two seeds", "`--quality best`"),
+}
+
+ONE_RENDER_OR_TWO = Table(
+    ("one_size",),
+    BY_SCENE,
+    ("spp", "input", "PSNR of"),
+    [
+        Line([str(spp), *cells], {"method": method, "spp": spp})
+        for spp in (2, 3, 8, 12, 32, 48, 128, 192)
+        for method, cells in INPUTS.items()
+    ],
+    [Column(name, "psnr", {"scene": name}) for name in SCENES if name not in NOISY_REFERENCE],
+)
+
 Block = Table | Callable[[], str]
 TABLES: dict[Path, dict[str, Block]] = {
     ROOT / "README.md": {"when_it_pays": WHEN_IT_PAYS},
     ROOT / "docs/design/results.md": {
         "accuracy_by_scene": ACCURACY_BY_SCENE,
+        "one_render_or_two": ONE_RENDER_OR_TWO,
         "how_sure": HOW_SURE,
         "detail": DETAIL,
         "sample_counts": SAMPLE_COUNTS,

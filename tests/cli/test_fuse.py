@@ -136,6 +136,8 @@ def test_nothing_is_overwritten_without_being_told(files, bilinear_models):
     [
         (["hr.exr", "lr.exr"], "the inputs look swapped"),
         (["hr.exr", "hr.exr"], "given twice"),
+        (["lr.exr", "hr.exr", "hr.exr"], "hr.exr: is a third render; give one, or two of the same frame"),
+        (["hr.exr", "--model", "paper"], "the model paper needs a low-resolution render"),
         (["lr.exr", "nothing.exr"], "nothing.exr: no such file"),
         (["lr.exr", "text.exr"], "text.exr: can't be opened as an EXR"),
         (["lr.exr", "hr.exr", "--map", "albedo=nothing"], "albedo is mapped to nothing, which is not there"),
@@ -170,6 +172,14 @@ def test_the_callers_mistakes_are_one_sentence_and_exit_code_2(files, bilinear_m
     assert "Traceback" not in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (files / "out.exr").exists()
+
+
+def test_one_render_is_enough(files):
+    done = fuse(files / "hr.exr", "-o", files / "out.exr", "--quality", "fast", "--json")
+    report = json.loads(done.stdout)
+    assert (report["model"], report["scale"], report["lrhs"]) == ("joint-small-x1", 1, None)
+    text = fuse(files / "hr.exr", "-o", files / "out.exr", "--quality", "fast", "--overwrite").stdout
+    assert text.splitlines()[0].startswith("Render at x1")
 
 
 def test_debug_shows_the_traceback_and_leaves_the_exit_code(files):

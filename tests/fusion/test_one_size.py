@@ -118,3 +118,11 @@ def test_arrays_choose_their_model(sigma, monkeypatch):
     assert chosen[2][0] == 2
     with pytest.raises(InputError, match="use one of fast, balanced, best"):
         fuse_arrays(images["rgb"], quality="good")
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (3, 5), (33, 47)])
+def test_any_size_will_do(size):
+    session = load_model(1, "fast", threads=1)
+    first, second = (Render.from_arrays(name, rgb=noisy(picture(*size), 4, seed)) for seed, name in enumerate("ab"))
+    for low in (first, second):
+        assert fuse(low, second, session).rgb.shape == (*size, 3)

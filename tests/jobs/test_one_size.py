@@ -8,6 +8,7 @@ import pytest
 
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_shot
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.inspection import inspect_file, inspect_noise
 from oiio_msspl.jobs.farm.openjd import make_job
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import find_shot
@@ -145,3 +146,11 @@ def test_a_job_has_one_sequence_of_renders(tmp_path):
     arguments = job.template["steps"][0]["script"]["actions"]["onRun"]["args"]
     assert "HRFolder" in names and "LRFolder" not in names
     assert arguments[:2] == ["{{Param.HRFolder}}/{{Param.HRName}}", "--output"]
+
+
+@pytest.mark.parametrize(("sigma", "noise"), [(0, "independent"), (0.5, "spread")])
+def test_inspection_of_one_render_tells_its_noise(tmp_path, sigma, noise):
+    inspection = inspect_file(write_render(tmp_path / "hr.exr", 1, sigma=sigma), InputOptions())
+    inspect_noise([inspection])
+    assert inspection.noise == noise
+    assert any(fact.startswith("noise: ") for fact in inspection.facts)

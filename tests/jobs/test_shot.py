@@ -234,7 +234,7 @@ SORTS = {
         "failed",
         "has pixel aspect 1",
     ),
-    "unsupported ratio": (other_size(HEIGHT, WIDTH), "failed", "a ratio of 1 is not supported"),
+    "unsupported ratio": (other_size(20, 30), "failed", "a ratio of 1.6 is not supported"),
     "other framing": (other_size(8, 16), "failed", "framing differs"),
     "other scale": (other_size(16, 24), "failed", "is for x4, but this pair is x2"),
     "black HRLS": (black, "failed", "the beauty is black"),

@@ -242,8 +242,12 @@ def _find_doubts(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> 
         for black_name, black, lit_name, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high))
         if _is_region(black, lit)
     ]
-    framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
+    scale, places = alignment.scale, (low, high)
+    if scale == ONE_SIZE and min(low.shape) > 1:  # means over 2 x 2 pixels have less noise than renders of full size
+        height, width = (side // 2 * 2 for side in low.shape)
+        scale, places = 2, (box_downsample(low[:height, :width], 2), box_downsample(high[:height, :width], 2))
+    framing = in_background(lambda: find_framing(*places))
     if _has_same_noise(hrls):
         if alignment.scale == ONE_SIZE:
             raise InputError(f"{lr_name} and {hr_name} have the same noise; render each with a noise seed of its own")
@@ -267,7 +271,7 @@ def _find_doubts(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> 
         f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)"
         for aov in foreign()
     ]
-    scale, grid, difference = alignment.scale, alignment.grid, framing()
+    grid, difference = alignment.grid, framing()
     x, y = difference.x * scale, difference.y * scale
     if max(abs(x), abs(y)) > max(MAX_SHIFT[0], MAX_SHIFT[1] * scale):
         warnings.append(
@@ -280,8 +284,9 @@ def _find_doubts(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> 
             f"the {tighter} is framed {100 * abs(difference.zoom):.1f} % tighter than the other render: are focal "
             "length, crop and overscan the same?"
         )
-    if not warnings and (place := _different_place(low, high)) is not None:
-        x, y = (start + scale * at for start, at in zip((grid.x0 * scale, grid.y0 * scale), place, strict=True))
+    if not warnings and (place := _different_place(*places)) is not None:
+        start = grid.x0 * alignment.scale, grid.y0 * alignment.scale
+        x, y = (first + scale * at for first, at in zip(start, place, strict=True))
         warnings.append(
             f"the two renders show different things, most of all around HRLS pixel ({x}, {y}): are they "
             "the same frame, with the same lights and objects?"

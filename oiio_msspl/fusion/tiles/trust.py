@@ -83,12 +83,16 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     means = np.stack([box_downsample(plane, renders.scale) for plane in high])
     if renders.scale == 1:
         high = high + np.float32(renders.share) * (low - high)
+    picture = np.stack(
+        [
+            _with_right_light(plane, lrhs, mean, renders, reach)
+            for plane, lrhs, mean in zip(picture, low, means, strict=True)
+        ]
+    )
     trust, points = _trust_in_detail(picture, low, high, means, renders, reach)
-    result = np.empty_like(picture)
-    for plane, detailed, lrhs, mean, target in zip(picture, high, low, means, result, strict=True):
-        _blend(plane, detailed, trust, points, target)
-        _correct_light(target, lrhs, mean, renders, reach)
-    return np.moveaxis(result, 0, -1), trust
+    for plane, detailed in zip(picture, high, strict=True):
+        _blend(plane, detailed, trust, points)
+    return np.moveaxis(picture, 0, -1), trust
 
 
 def _trust_in_detail(
@@ -190,8 +194,8 @@ def _squared_noise(lrhs: Array, mean: Array) -> Array:
     return np.square(lrhs - mean) + np.float32(2 * ROUNDING**2) * np.square(np.maximum(lrhs, mean))
 
 
-def _blend(fused: Array, render: Array, trust: Array, points: Array, target: Array) -> None:
-    """Fill ``target`` with ``fused`` and a part of its difference to a render, planes (s*h, s*w).
+def _blend(picture: Array, render: Array, trust: Array, points: Array) -> None:
+    """Add a part of its difference to a render to a picture, planes (s*h, s*w).
 
     The part is ``trust`` (h, w), interpolated, and at least ``points`` (h, w) over a whole LRHS pixel.
     """
@@ -201,13 +205,13 @@ def _blend(fused: Array, render: Array, trust: Array, points: Array, target: Arr
         place = slice(rows.start // scale, rows.stop // scale)
         weight = upsample_linear(trust, scale, place)
         np.maximum(weight, points[place].repeat(scale, axis=0).repeat(scale, axis=1), out=weight)
-        target[rows] = fused[rows] + weight * (render[rows] - fused[rows])
+        picture[rows] += weight * (render[rows] - picture[rows])
 
     for_row_blocks(work, len(render), render.shape[1], multiple=scale)
 
 
-def _correct_light(picture: Array, lrhs: Array, mean: Array, renders: Renders, reach: int) -> None:
-    """Bring the light of a picture (s*h, s*w) to that of both renders where they agree that it differs.
+def _with_right_light(picture: Array, lrhs: Array, mean: Array, renders: Renders, reach: int) -> Array:
+    """Return a picture (s*h, s*w) with the light of both renders where they agree that it differs.
 
     The differences of the renders to the picture are divided into levels of resolution, and each is shrunk by its own
     evidence: the light of large areas is known best. The picture is multiplied, so its detail stays.
@@ -224,10 +228,14 @@ def _correct_light(picture: Array, lrhs: Array, mean: Array, renders: Renders, r
     change = brightness * _agreed(low, high, np.float32(renders.share), levels) / np.maximum(own, 0.01 * brightness)
     factor = np.clip(1 + change, 1 / LARGEST_FACTOR, LARGEST_FACTOR).astype(np.float32)
 
+    result = np.empty_like(picture)
+
     def work(rows: slice) -> None:
-        picture[rows] *= upsample_linear(factor, scale, slice(rows.start // scale, rows.stop // scale))
+        place = slice(rows.start // scale, rows.stop // scale)
+        np.multiply(picture[rows], upsample_linear(factor, scale, place), out=result[rows])
 
     for_row_blocks(work, len(picture), picture.shape[1], multiple=scale)
+    return result
 
 
 def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:

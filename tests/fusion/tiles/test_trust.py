@@ -58,7 +58,7 @@ def test_detail_that_both_renders_show_comes_back(scale: int) -> None:
     result, trust = trust_renders(wall(), renders, REACH)
     assert rms(wall(), truth) > 0.25
     assert rms(result, truth) < rms(renders.hrls, truth)
-    assert trust.mean() > 0.8
+    assert trust.mean() > 0.7
 
 
 def test_two_renders_of_one_size_tell_their_noise() -> None:

@@ -14,7 +14,8 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.checks.pair import HrlsAverages, bounded_luminance, check_pair
+from oiio_msspl.fusion.checks.averages import HrlsAverages, bounded_luminance
+from oiio_msspl.fusion.checks.pair import check_pair
 from oiio_msspl.fusion.passes.fuse import FusedPasses
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
@@ -109,7 +110,7 @@ def fuse(
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb
-        frame.warnings += check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
+        frame.warnings += check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name).warnings
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
     frame.warnings += _lost_aovs(frame)
     frame.seconds = session.seconds - seconds

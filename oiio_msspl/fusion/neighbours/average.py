@@ -79,7 +79,7 @@ def average_renders(
         return RenderBand(pair, light, low, high, core, area)
 
     frames = _average(alignment, light, before, after, band, _weight(sum(image.shape[-1] for image in high.values())))
-    return _replaced(pair.lr, low), _replaced(pair.hr, high), frames
+    return _replaced(pair.lr, low, alignment.lr_data_window), _replaced(pair.hr, high, window), frames
 
 
 def average_results(
@@ -158,5 +158,6 @@ def _weight(channels: int) -> float:
     return max(1.0, needed / usual)
 
 
-def _replaced(render: ReadableRender, layers: Features) -> Render:
-    return Render(layers, render.data_window, render.display_window, render.pixel_aspect, name=render.name)
+def _replaced(render: ReadableRender, layers: Features, window: Window) -> Render:
+    display = render.display_window
+    return Render(layers, window.shift(display.x0, display.y0), display, render.pixel_aspect, name=render.name)

@@ -40,6 +40,7 @@ def fuse_files(
     preview_path: str | Path | None = None,
     view_transform: str | None = None,
     overwrite: bool = False,
+    strict: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> FrameReport:
     """Fuse a pair of EXR files.
@@ -57,6 +58,7 @@ def fuse_files(
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
+        strict: refuse a frame that has a warning, and write nothing.
         progress: called with (steps done, steps in all). A step is a tile, or a band of rows of a set of passes.
 
     Returns:
@@ -78,7 +80,7 @@ def fuse_files(
             raise InputError(f"{preview_path}: the preview is a PNG; name it .png")
         if view_transform is not None:
             check_view(view_transform)
-    settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite)
+    settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite, strict=strict)
     files = FrameFiles(0, Path(lr_path), Path(hr_path), output, preview_path)
     run = ShotRun(settings, ShotPlan(), [files], only_frame=True, tell=progress)
     views = run.read(files)

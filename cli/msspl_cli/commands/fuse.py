@@ -97,6 +97,7 @@ def fuse(
     preview: Annotated[bool, option(OUTPUT, "Write an sRGB PNG beside OUT.", hidden=True)] = True,
     view: Annotated[str | None, option(OUTPUT, "Preview in an OpenColorIO view.", metavar="VIEW", hidden=True)] = None,
     overwrite: options.Overwrite = False,
+    strict: options.Strict = False,
     as_json: options.Json = False,
     # Shot
     frames: options.Frames = None,
@@ -149,6 +150,7 @@ def fuse(
         "max_memory": options.parse_bytes(max_memory),
         "view_transform": view,
         "overwrite": overwrite,
+        "strict": strict,
     }
     over_time = TemporalOptions(temporal, motion_format)
     use_threads(threads)

@@ -51,9 +51,9 @@ FILTER_FRACTION = 0.1
 MIN_NOISY_PIXELS = 256
 #: The LRHS consists of HRLS pixels if this fraction of its noisy pixels equal an HRLS pixel.
 EQUAL_PIXELS = 0.5
-#: A render may be black by chance if at most this many pixels of the other render are lit. Around a rectangle, this
-#: fraction of the pixels may be lit as well.
-MOST_BY_CHANCE, REGION = 64, 0.05
+#: A render may be black by chance if at most this many pixels of the other render are lit. Around a rectangle, that
+#: render may also have this fraction of the brightness inside: the soft edge of an object, where samples are few.
+MOST_BY_CHANCE, REGION = 64, 0.1
 #: A bucket failed if, by chance, fewer squares than this would be black.
 SQUARES_BY_CHANCE = 0.01
 #: The warning for a pair that is black.
@@ -253,8 +253,9 @@ def _is_region(black: Array, lit: Array) -> bool:
     outside = np.ones(black.shape, np.bool_)
     # The pixel filter of the other render may reach further.
     outside[max(rows[0] - 2, 0) : rows[-1] + 3, max(columns[0] - 2, 0) : columns[-1] + 3] = False
-    lit_pixels = np.count_nonzero(lit[outside])
-    return bool(lit_pixels > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
+    if np.count_nonzero(lit[outside]) <= MOST_BY_CHANCE:
+        return False
+    return float(lit[outside].mean()) > REGION * float(lit[~outside].mean())
 
 
 def _brightness_ratio(low: Array, high: Array) -> tuple[float, bool]:

@@ -101,14 +101,16 @@ def read_tile(
     if lost.any():
         lost &= ~_as_bright(low[RGB]).repeat(scale, axis=0).repeat(scale, axis=1)
     lost |= broken.get(RGB, False)
+    if lost.any():
+        hrls[RGB] = np.where(lost[..., None], enlarged(low[RGB], scale), hrls[RGB])
     failed = _failed_buckets(low[RGB], hrls[RGB], scale)
     if failed is not None:
         in_bucket = grown(failed[1]).repeat(scale, axis=0).repeat(scale, axis=1)
-        lost |= in_bucket & _is_dead(hrls[RGB])
+        dead = in_bucket & _is_dead(hrls[RGB])
+        hrls[RGB] = np.where(dead[..., None], enlarged(low[RGB], scale), hrls[RGB])
         for name in hrls.keys() - {RGB}:
             hrls[name] = filled(hrls[name], in_bucket & ~hrls[name].any(axis=-1))
-    if lost.any():
-        hrls[RGB] = np.where(lost[..., None], enlarged(low[RGB], scale), hrls[RGB])
+        lost |= dead
     lost_below = _infinite(low[RGB])
     if failed is not None or lost_below.any():
         means = box_downsample(hrls[RGB], scale)

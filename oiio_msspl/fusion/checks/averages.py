@@ -112,7 +112,7 @@ class HrlsAverages:
             # Black pixels are equal in any two renders where light is rare.
             noisy = (grey > 0) & (expected > np.square(np.float32(NOISY) * grey))
             equal, by_chance = (
-                reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - value) for i, j in phases)) <= 1e-3 * value
+                reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - value) for i, j in phases)) < 1e-3 * value
                 for value in (grey, np.roll(grey, 1, axis=1))
             )
             values[:3, rows], values[3:6, rows] = planes_of(colour), planes_of(mean)

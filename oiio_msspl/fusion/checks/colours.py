@@ -18,8 +18,8 @@ CERTAIN = 4.0
 #: Colours are not compared if there are fewer blocks.
 MIN_BLOCKS = 64
 
-#: Colours that differ by less differ by rounding alone.
-LEAST = 0.003
+#: White balances that differ by less differ by rounding alone.
+LEAST = 0.02
 
 _SPACES = {
     "linear Rec.709": REC709,
@@ -41,6 +41,8 @@ def _readings(low: Colours, high: Colours) -> Iterator[tuple[str, Colours, Colou
     yield "the HRLS looks encoded for a display (sRGB) and the LRHS linear", _srgb(low), _from_srgb(high)
     gains = (high.sum(axis=1) / low.sum(axis=1))[:, None]
     gains /= np.exp(np.log(gains).mean())
+    if np.abs(np.log(gains)).max() < LEAST:
+        return
     words = ", ".join(f"{gain:.2f}" for gain in gains.ravel())
     yield f"the white balance of the two renders differs (by {words} in red, green and blue)", low * gains, high / gains
 
@@ -66,7 +68,7 @@ def different_colours(low: Colours, high: Colours) -> str | None:
         return None
     chromaticities = _chromaticities(low), _chromaticities(high)
     as_it_is = _differences(*chromaticities)
-    if as_it_is.mean() < LEAST or min(low.sum(axis=1).min(), high.sum(axis=1).min()) <= 0:
+    if min(low.sum(axis=1).min(), high.sum(axis=1).min()) <= 0:
         return None
     best, least = None, BETTER * as_it_is.mean()
     for words, forwards, backwards in _readings(low, high):

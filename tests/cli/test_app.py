@@ -41,7 +41,7 @@ SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --quality --device --max-memory --output --layout --layers --passes --error-layer "
         "--overwrite --json --frames --temporal --skip-existing --help --help-all",
-        21,
+        22,
     ),
     "msspl_render": (
         "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output "

@@ -98,6 +98,9 @@ TrustLayer = Annotated[bool, option(OUTPUT, _TRUST_LAYER, "--trust-layer", hidde
 _DATA_PASSES = "Add the layers 'denoised_albedo' and 'denoised_normal'. It needs --quality best."
 DataPasses = Annotated[bool, option(OUTPUT, _DATA_PASSES, "--data-passes", hidden=True)]
 Overwrite = Annotated[bool, option(OUTPUT, "Replace existing files.", "--overwrite")]
+Strict = Annotated[
+    bool, option(OUTPUT, "Take a warning for an error: do not write that frame.", "--strict", hidden=True)
+]
 Json = Annotated[bool, option(OUTPUT, "Print a report as JSON on standard output.", "--json")]
 
 _FRAMES = "Take only these frames: 1001-1100x2 or 1001,1005-1010. \\[default: all]"

@@ -43,6 +43,11 @@ class Window:
         x0, y0 = max(self.x0, window.x0), max(self.y0, window.y0)
         return Window(x0, y0, max(x0, min(self.x1, window.x1)), max(y0, min(self.y1, window.y1)))
 
+    def union(self, window: Window) -> Window:
+        """Return the smallest rectangle around both."""
+        x0, y0 = min(self.x0, window.x0), min(self.y0, window.y0)
+        return Window(x0, y0, max(self.x1, window.x1), max(self.y1, window.y1))
+
     def shift(self, dx: int, dy: int) -> Window:
         """Return the rectangle moved by ``dx`` pixels to the right and ``dy`` pixels down."""
         return Window(self.x0 + dx, self.y0 + dy, self.x1 + dx, self.y1 + dy)
@@ -106,10 +111,15 @@ class Render:
         return cls({k: np.asarray(v, dtype=np.float32) for k, v in arrays.items()}, window, window, name=name)
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """Return features over a rectangle as views of the whole arrays, as :meth:`ReadableRender.read` does."""
-        rows, columns = window.slices(self.data_window)
+        """Return features over a rectangle, as :meth:`ReadableRender.read` does: views if the arrays cover it."""
+        inside = window.intersect(self.data_window)
         names = self.layers if features is None else [f for f in features if f in self.layers]
-        return {name: self.layers[name][rows, columns] for name in names}
+        layers = {name: self.layers[name][inside.slices(self.data_window)] for name in names}
+        if inside == window:
+            return layers
+        rows, columns = inside.slices(window)
+        margins = [(rows.start, window.height - rows.stop), (columns.start, window.width - columns.stop), (0, 0)]
+        return {name: np.pad(values, margins) for name, values in layers.items()}
 
     def unload(self) -> None:
         """Give the memory of pixels that wait in temporary files back to the system."""
@@ -141,7 +151,7 @@ class ReadableRender(Protocol):
         """Width of a pixel divided by its height."""
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """Return features over a rectangle inside the data window, float32 (height, width, channels) each.
+        """Return features over a rectangle, float32 (height, width, channels) each; 0 outside of the data window.
 
         Values are as stored: NaN and infinities may be among them.
 

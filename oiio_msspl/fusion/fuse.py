@@ -14,7 +14,8 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.checks.pair import HrlsAverages, are_not_independent, bounded_luminance, check_pair
+from oiio_msspl.fusion.checks.averages import HrlsAverages, bounded_luminance
+from oiio_msspl.fusion.checks.pair import Judgement, check_pair
 from oiio_msspl.fusion.passes.fuse import FusedPasses
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
@@ -116,7 +117,15 @@ def fuse(
                 if progress is not None:
                     progress(task.number, task.count)
                 del task  # or its memory would be held while the next one is fused
-        if frame.trust is not None and are_not_independent(averages):
+        if frame.tiles > 1:
+            session.release_memory()  # to check a large frame needs memory, too
+        judgement = Judgement()
+        if lr is hr:
+            frame.lrhs_luminance, frame.hrls_luminance = even_and_odd(averages.rgb)
+        else:
+            frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb
+            judgement = check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
+        if frame.trust is not None and not judgement.independent:
             # The noise of one render can't be told from detail by that of the other one.
             return fuse(
                 lr,
@@ -131,13 +140,7 @@ def fuse(
                 held=held,
                 progress=progress,
             )
-        if frame.tiles > 1:
-            session.release_memory()  # to check a large frame needs memory, too
-        if lr is hr:
-            frame.lrhs_luminance, frame.hrls_luminance = even_and_odd(averages.rgb)
-        else:
-            frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb
-            frame.warnings += check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
+        frame.warnings += judgement.warnings
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
     frame.warnings += _lost_aovs(frame)
     frame.seconds = session.seconds - seconds

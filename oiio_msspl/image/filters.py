@@ -137,6 +137,22 @@ def grown(mask: Mask, reach: int = 1) -> Mask:
     return ~all_within(~mask, reach)
 
 
+def in_squares(whole: Mask, partly: Mask, side: int, fraction: float) -> Mask:
+    """Return the pixels (h, w) that lie in squares of ``side`` x ``side`` pixels that fulfil two conditions.
+
+    Args:
+        whole: true in all of the square.
+        partly: true in at least this ``fraction`` of the square.
+    """
+    if min(whole.shape) < side or not whole.any():
+        return np.zeros_like(whole)
+    windows = np.lib.stride_tricks.sliding_window_view
+    squares = windows(windows(whole, side, 0).all(axis=-1), side, 1).all(axis=-1)
+    counts = windows(windows(partly, side, 0).sum(axis=-1, dtype=np.int32), side, 1).sum(axis=-1)
+    squares = np.pad(squares & (counts >= fraction * side**2), side - 1)
+    return np.asarray(windows(windows(squares, side, 0).any(axis=-1), side, 1).any(axis=-1))
+
+
 def max_3x3(values: Array) -> Array:
     """Return the largest of the 3 x 3 values around each pixel, (h, w, ...)."""
     largest = values.copy(order="K")

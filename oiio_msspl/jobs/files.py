@@ -40,6 +40,7 @@ def fuse_files(
     preview_path: str | Path | bool | None = None,
     view_transform: str | None = None,
     overwrite: bool = False,
+    strict: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> FrameReport:
     """Fuse the EXR files of a frame: one render, or two.
@@ -58,6 +59,7 @@ def fuse_files(
         preview_path: PNG to write; True for one beside the result, None for none.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
+        strict: refuse a frame that has a warning, and write nothing.
         progress: called with (thousandths done, 1000) of the whole work, from reading to writing.
 
     Returns:
@@ -82,7 +84,7 @@ def fuse_files(
             raise InputError(f"{preview_path}: the preview is a PNG; name it .png")
         if view_transform is not None:
             check_view(view_transform)
-    settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite)
+    settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite, strict=strict)
     preview = Path(preview_path) if preview_path else None
     files = FrameFiles(0, *both_paths(lr_path, hr_path), output, preview)
     if progress is not None:

@@ -25,6 +25,8 @@ class PairCheck:
     """Why the pair can't be fused; None if it can."""
     warnings: list[str] = field(default_factory=list)
     """Why the renders may not show the same frame, one sentence each. A sentence about some views names them."""
+    not_judged: list[str] = field(default_factory=list)
+    """What could not be judged, for lack of light, of structure or of pixels: a few words each."""
     passed_on: tuple[str, ...] = ()
     """Why views beside the first one can't be fused, one sentence each."""
 
@@ -35,8 +37,9 @@ class PairCheck:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the check as JSON values."""
-        findings = {"problem": self.problem, "warnings": self.warnings, "passed_on": self.passed_on}
-        return {"lrhs": None if self.lr is None else str(self.lr), "hrls": str(self.hr), "fits": self.fits, **findings}
+        findings = {"problem": self.problem, "warnings": self.warnings, "not_judged": self.not_judged}
+        names = {"lrhs": None if self.lr is None else str(self.lr), "hrls": str(self.hr)}
+        return {**names, "fits": self.fits, **findings, "passed_on": self.passed_on}
 
 
 def check_files(lr: str | Path | None, hr: str | Path, inputs: InputOptions = InputOptions()) -> PairCheck:
@@ -54,7 +57,11 @@ def check_files(lr: str | Path | None, hr: str | Path, inputs: InputOptions = In
         first = map_pair(*both_paths(lr, hr), inputs)
         others = find_other_views(*first, inputs)
         views = [first, *((view.lr, view.hr) for view in others.views)]
-        warnings = merged({high.view: check_renders(low, high) for low, high in views if low is not high})
-        return PairCheck(lr, hr, warnings=warnings, passed_on=others.passed_on)
+        judgements = {high.view: check_renders(low, high) for low, high in views if low is not high}
+        warnings, not_judged = (
+            merged({view: getattr(judgement, name) for view, judgement in judgements.items()})
+            for name in ("warnings", "not_judged")
+        )
+        return PairCheck(lr, hr, warnings=warnings, not_judged=not_judged, passed_on=others.passed_on)
     except InputError as error:
         return PairCheck(lr, hr, problem=str(error))

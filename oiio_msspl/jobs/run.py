@@ -208,6 +208,8 @@ class ShotRun:
             picture.replaced = first.replaced
             self._fuse_passes(first, picture)
             first.picture, first.report = picture, self._report(first, picture, [*first.others, *views[1:]])
+            if self.settings.strict and first.report.warnings:
+                raise InputError(f"not written, because warnings are errors: {'; '.join(first.report.warnings)}")
             busy = sum(frame.seconds["fuse"] for frame in views) + time.perf_counter() - start
             network = first.report.network_seconds
             first.report.seconds = {"read": first.seconds["read"], "fuse": busy, "network": network}

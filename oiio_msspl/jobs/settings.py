@@ -41,6 +41,8 @@ class Settings:
     """Leave frames alone whose EXR exists."""
     update: bool = False
     """Of these, fuse those again whose inputs are newer than their EXR."""
+    strict: bool = False
+    """Refuse a frame that has a warning, and write nothing."""
     sessions: dict[tuple[int, str | None], Session] = field(default_factory=dict)
     """Models that are loaded, by scale and ``model``."""
 

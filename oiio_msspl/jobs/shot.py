@@ -59,6 +59,7 @@ def fuse_shot(
     previews: bool = False,
     view_transform: str | None = None,
     overwrite: bool = False,
+    strict: bool = False,
     skip_existing: bool = False,
     update: bool = False,
     report_path: str | Path | None = None,
@@ -77,6 +78,7 @@ def fuse_shot(
             :class:`oiio_msspl.jobs.plan.TemporalOptions` also say how motion is stored.
         previews: write a PNG beside each EXR.
         overwrite: replace existing files.
+        strict: refuse a frame that has a warning, and write nothing.
         skip_existing: skip frames whose EXR exists. This resumes a run that was ended.
         update: as ``skip_existing``, but fuse a frame again if an input is newer than its EXR, as ``make`` does.
         report_path: JSON file that is kept up to date frame by frame. With ``skip_existing``, skipped frames keep
@@ -112,7 +114,7 @@ def fuse_shot(
     with limit_threads(threads):
         plan = plan_temporal(shot, inputs, temporal, model, write)
     skip, memory = skip_existing or update, bytes_of(max_memory)
-    settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update)
+    settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update, strict)
     report = ShotReport(shot, temporal=plan.text, neighbours=plan.count)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
     make_output(shot)

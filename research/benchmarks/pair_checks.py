@@ -30,7 +30,7 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.checks.pair import BOTH_BLACK, check_renders
 from oiio_msspl.image.arrays import Array
-from oiio_msspl.image.colour import ACESCG, REC709, conversion
+from oiio_msspl.image.colour import ACESCG, P3, REC709, conversion, srgb
 from oiio_msspl.image.filters import box_downsample, interpolate
 from research.benchmarks import results
 
@@ -100,7 +100,7 @@ class Pair:
         """Return what the checks say, or why they refuse the pair."""
         lrhs, hrls = np.ascontiguousarray(self.lrhs[RGB]), {k: np.ascontiguousarray(v) for k, v in self.hrls.items()}
         try:
-            return check_renders(Render.from_arrays("lr", rgb=lrhs), Render.from_arrays("hr", **hrls))
+            return check_renders(Render.from_arrays("lr", rgb=lrhs), Render.from_arrays("hr", **hrls)).warnings
         except InputError as error:
             return [str(error)]
 
@@ -122,7 +122,7 @@ def wrong_pairs(pair: Pair, stranger: View, following: Layers | None) -> Iterato
     def high(**layers: Array) -> Pair:
         return replace(pair, hrls=pair.hrls | layers)
 
-    matrix = conversion(REC709, ACESCG).astype(np.float32).T
+    matrix, p3 = (conversion(REC709, space).astype(np.float32).T for space in (ACESCG, P3))
     x, y = ((1, 0), (-1, 0), (0, 1), (0, -1))[rng.integers(4)]
     yield "crop 3 % tighter", low(_zoomed(lrhs, 0.97))
     yield "red and blue swapped", low(lrhs[..., ::-1])
@@ -135,13 +135,23 @@ def wrong_pairs(pair: Pair, stranger: View, following: Layers | None) -> Iterato
     if following is not None:
         shape = pair.hrls[RGB].shape
         yield "next frame of a moving camera", high(**{k: v[: shape[0], : shape[1]] for k, v in following.items()})
+    yield "LRHS mirrored", low(lrhs[:, ::-1])
+    yield "LRHS of another scene", low(_fitted(stranger.layers(f"lr_x{scale}_{scale**2}spp")[RGB], lrhs.shape))
     yield "LRHS scaled down: box", low(box_downsample(pair.hrls[RGB], scale))
-    for filter_name in ("lanczos3", "cubic"):
+    for filter_name in ("lanczos3", "cubic", "gaussian"):
         yield f"LRHS scaled down: {filter_name}", low(_resized(pair.hrls[RGB], scale, filter_name))
     yield "LRHS scaled down: nearest", low(pair.hrls[RGB][scale // 2 :: scale, scale // 2 :: scale])
     yield "LRHS in ACEScg", low(lrhs @ matrix)
     yield "HRLS in ACEScg", high(rgb=pair.hrls[RGB] @ matrix)
+    yield "LRHS in Display P3", low(lrhs @ p3)
+    yield "LRHS encoded for sRGB", low(srgb(lrhs))
+    yield "LRHS in another white balance", low(lrhs * np.array([1.25, 1, 0.8], np.float32))
     yield "exposure one stop up", low(lrhs * np.float32(2))
+    for name, kind in ((NORMAL, "normals"), (ALBEDO, "albedo")):
+        if name in pair.hrls:
+            yield f"{kind} shifted by 8 pixels", high(**{name: _shifted(pair.hrls[name], 8 * x, 8 * y)})
+    if NORMAL in pair.hrls:
+        yield "normals negated", high(normal=-pair.hrls[NORMAL])
 
 
 def _zoomed(image: Array, share: float) -> Array:

@@ -42,7 +42,7 @@ SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --quality --device --max-memory --output --layout --layers --passes --error-layer "
         "--overwrite --json --frames --temporal --skip-existing --help --help-all --version",
-        23,
+        24,
     ),
     "msspl_render": (
         "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output "

@@ -44,6 +44,18 @@ def test_the_example_is_fused_with_its_passes_and_without_a_warning(tmp_path):
     assert "components: fused" in done.stdout
 
 
+def test_with_strict_a_warning_is_an_error(files, bilinear_models):
+    """A good pair is written; one with a warning is not."""
+    options = ("--model", bilinear_models[4], "--no-preview", "--strict")
+    assert fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", *options).returncode == 0
+    bright = oiio.ImageBuf(str(files / "lr.exr"))
+    oiio.ImageBufAlgo.mul(bright, bright, 4.0)
+    assert bright.write(str(files / "bright.exr"))
+    done = fuse(files / "bright.exr", files / "hr.exr", "-o", files / "no.exr", *options)
+    assert done.returncode == 2 and not (files / "no.exr").exists()
+    assert "not written, because warnings are errors: " in done.stderr and "times as bright" in done.stderr
+
+
 def test_a_quality_names_the_model(files):
     pair = files / "lr.exr", files / "hr.exr", "-o", files / "out.exr"
     done = fuse(*pair, "--quality", "fast", "--no-preview", "--json")

@@ -88,6 +88,14 @@ def test_a_failure_has_one_text_whoever_reads_it(tmp_path, bilinear_models):
     assert done.stderr.splitlines() == [told.replace("openjd_fail", "error")]
 
 
+def test_with_strict_only_the_frame_with_a_warning_fails(tmp_path, bilinear_models):
+    make_shot(tmp_path, 2)
+    write_exr(tmp_path / "hr/beauty.1002.exr", {name: plane * 4 for name, plane in layers(1002).items()})
+    done = fuse(tmp_path / "lr", tmp_path / "hr", "-o", tmp_path / "out", "--model", bilinear_models[4], "--strict")
+    assert done.returncode != 0 and "not written, because warnings are errors: the HRLS is" in done.stdout + done.stderr
+    assert [path.stem[-4:] for path in (tmp_path / "out").glob("*.exr")] == ["1001"]
+
+
 def test_what_a_person_reads(tmp_path, bilinear_models):
     folder = make_shot(tmp_path, 4)
     for number in (1002, 1003):

@@ -795,3 +795,31 @@ def test_an_lrhs_with_the_noise_of_the_hrls_brings_no_noise_back():
     frame = fuse(*pair, Session(find_model(2, "joint-small")))
     assert frame.trust is None
     assert any("the LRHS has the noise of the HRLS" in warning for warning in frame.warnings)
+
+
+def cropped(render):
+    """A render whose data window is the box around what is not empty."""
+    rows, columns = (np.flatnonzero(render.layers["alpha"].any(axis=(axis, 2))) for axis in (1, 0))
+    window = Window(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+    layers = {name: image[window.slices(render.data_window)] for name, image in render.layers.items()}
+    return Render(layers, window, render.display_window, name=render.name)
+
+
+def test_renders_that_are_cropped_to_what_is_not_empty_are_fused(session, scale):
+    """A soft-edged object before an empty film. Noise decides where each render ends: here the LRHS ends first."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[: 48 * scale, : 64 * scale] / scale
+    cover = 1 / (1 + np.exp((np.hypot(y - 24, x - 32) - 12) / 2))[..., None]
+    share = downsample(cover, scale)
+    masks = np.where(share > 0.4 / scale**2, share, 0), rng.binomial(4, cover) / 4
+    whole = [
+        Render.from_arrays(name, rgb=(mask * np.array([0.8, 0.5, 0.3])).astype(np.float32), alpha=mask)
+        for name, mask in zip(("lr", "hr"), masks, strict=True)
+    ]
+    low, high = (cropped(render) for render in whole)
+    assert low.data_window.x0 * scale > high.data_window.x0 + scale
+    fused, expected = fuse(low, high, session), fuse(*whole, session)
+    inside = high.data_window.slices(whole[1].data_window)
+    assert fused.warnings == []
+    np.testing.assert_allclose(fused.rgb, expected.rgb[inside], atol=0.02)
+    np.testing.assert_allclose(fused.alpha, expected.alpha[inside], atol=0.02)

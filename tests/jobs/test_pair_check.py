@@ -96,6 +96,17 @@ def test_checking_names_what_is_wrong(tmp_path):
     assert check.as_dict()["fits"] is False
 
 
+def test_checking_says_what_it_could_not_judge(tmp_path):
+    """A flat picture has no framing. That of a lit one is judged, and its light is not in its albedo."""
+    flat = np.full((96, 128, 3), 0.2, np.float32)
+    for name, image, spp in (("lr", downsample(flat, 4), 64), ("hr", flat, 4)):
+        write_exr(tmp_path / f"{name}.exr", rgb(noisy(image, spp, seed=spp).astype(np.float32)))
+    check = check_files(tmp_path / "lr.exr", tmp_path / "hr.exr")
+    assert check.fits
+    assert {"whether both show the same thing", "the framing"} <= set(check.not_judged)
+    assert check.as_dict()["not_judged"] == check.not_judged
+
+
 def test_the_first_whole_pair_of_a_shot_is_checked(tmp_path):
     make_shot(tmp_path, 3)
     (tmp_path / "lr/lr.1001.exr").unlink()

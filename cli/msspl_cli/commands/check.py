@@ -78,5 +78,6 @@ def _print(number: int | None, pair: PairCheck, as_json: bool) -> None:
         console.say(f"{name}: can't be fused: {pair.problem}")
     else:
         console.say(f"{name}: {'fits' if pair.fits else 'does not fit'}")
-    for warning in (*pair.warnings, *pair.passed_on):
-        console.say(f"  {warning}")
+    not_judged = [f"not judged: {', '.join(pair.not_judged)}"] if pair.not_judged else []
+    for text in (*pair.warnings, *pair.passed_on, *not_judged):
+        console.say(f"  {text}")

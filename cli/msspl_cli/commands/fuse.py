@@ -107,6 +107,7 @@ def fuse(
         str | None, option(OUTPUT, "Preview in an OpenColorIO view.", "--ocio-view", metavar="NAME", hidden=True)
     ] = None,
     overwrite: options.Overwrite = False,
+    strict: options.Strict = False,
     as_json: options.Json = False,
     # Shot
     frames: options.Frames = None,
@@ -165,6 +166,7 @@ def fuse(
         "max_memory": bytes_of(max_memory),
         "view_transform": view,
         "overwrite": overwrite,
+        "strict": strict,
     }
     over_time = TemporalOptions(temporal, motion_format)
     use_threads(threads)

@@ -3,12 +3,12 @@
 
 The strength of an AOV's edges in the picture is unknown: a dark corner hides them, and a mirror shows others. So the
 AOV is its own control. Its edges, shifted by some pixels, say how well edges fit by chance. Without a shift they must
-fit better.
+fit better than that, and no shift may fit clearly better.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ FITS = {ALBEDO: 3.5, NORMAL: 1.5}
 SAME_FRAME = 4.0
 #: Both renders show the same edges if these fit this well. Otherwise normals can't be judged.
 VISIBLE = 3.0
+#: An AOV is shifted if its edges fit this well with a shift, and this much better than without.
+SHIFTED, BY = 6.0, 3.0
 #: A pattern is the same in two pictures if its correlations with both, by shift, correlate this much. Boards, tiles and
 #: blinds reach 0.99, albedos and normals of other scenes 0.36.
 SAME_PATTERN = 0.6
@@ -40,18 +42,30 @@ NOISE = 0.5
 EDGE = 0.2
 
 
-def foreign_aovs(
+@dataclass
+class Aovs:
+    """How the albedo and the normal fit the picture."""
+
+    judged: list[str] = field(default_factory=list)
+    """Those that could be judged."""
+    foreign: list[str] = field(default_factory=list)
+    """Those of another frame."""
+    shifted: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Those that lie elsewhere than the picture, and how far to the right and down, in LRHS pixels."""
+
+
+def judge_aovs(
     low: Array, high: Array, albedo: Array | None, normal_edges: Array | None, normal_noise: Array | None
-) -> list[str]:
-    """Return the AOVs, of "albedo" and "normal", that are of another frame than the picture.
+) -> Aovs:
+    """Check whether albedo and normal are of the frame that the picture shows.
 
     Args:
         low, high: luminance (h, w) of LRHS and HRLS.
-        albedo, normal_edges, normal_noise: see :class:`oiio_msspl.fusion.checks.pair.HrlsAverages`.
+        albedo, normal_edges, normal_noise: see :class:`oiio_msspl.fusion.checks.averages.HrlsAverages`.
     """
     low, high = central_area(low), central_area(high)
     if min(low.shape) < SMALLEST:
-        return []
+        return Aovs()
     lengths = {}
     if albedo is not None:
         surface = np.clip(albedo, 0, 1)
@@ -60,31 +74,40 @@ def foreign_aovs(
         lengths[NORMAL] = np.minimum(normal_edges, 0.5)
     edges = {name: _Edges.of(v) for name, v in lengths.items() if np.count_nonzero(v > EDGE) >= MIN_EDGES}
     if not edges:
-        return []
+        return Aovs()
     total = low + high
     lit = total[total > 0]
     floor = 0.1 * quantile(lit, 0.5) if lit.size else 1.0
     differences = _log_differences(total, floor)
     picture = _Edges.of(np.minimum(_length(differences), 1))
+    shifted = {name: shift for name, v in edges.items() if (shift := picture.shift_of(v)) is not None}
     fits = {name: v.fit(picture) for name, v in edges.items()}
-    foreign = [name for name, fit in fits.items() if fit < FITS[name]]
+    doubtful = [name for name, fit in fits.items() if fit < FITS[name] and name not in shifted]
     # Differences have a sign, too: a brighter albedo is brighter in the picture. A light may turn that around.
-    if ALBEDO in foreign and abs(_fit_signed(_log_differences(surface, 0.05), differences)) >= FITS[ALBEDO]:
-        foreign.remove(ALBEDO)
-    foreign = [name for name in foreign if not edges[name].repeat_in(picture)]
-    if not foreign:
-        return []
-    # If shapes are seen, so are colours. Even light shows colours without shapes.
-    if foreign != [ALBEDO] or fits.get(NORMAL, 0) < SAME_FRAME:
-        renders = [_Edges.of(np.minimum(_length(_log_differences(v, floor / 2)), 1)) for v in (low, high)]
-        if renders[0].fit(renders[1]) < VISIBLE:
-            return []
-    if len(edges) == 2 and len(foreign) == 1 and edges[ALBEDO].fit(edges[NORMAL]) > SAME_FRAME:
-        return []  # one AOV fits the picture, and the second one fits the first
+    if ALBEDO in doubtful and abs(_fit_signed(_log_differences(surface, 0.05), differences)) >= FITS[ALBEDO]:
+        doubtful.remove(ALBEDO)
+    doubtful = [name for name in doubtful if not edges[name].repeat_in(picture)]
+    foreign = _foreign(doubtful, edges, fits, [_log_differences(v, floor / 2) for v in (low, high)])
     if NORMAL in foreign and normal_edges is not None and normal_noise is not None:
         # Normals that are noise can't be judged. That does not change how the albedo is judged.
-        return [name for name in foreign if name != NORMAL or not _are_noise(normal_edges, normal_noise)]
-    return foreign
+        foreign = [name for name in foreign if name != NORMAL or not _are_noise(normal_edges, normal_noise)]
+    return Aovs([name for name in edges if name not in doubtful or name in foreign], foreign, shifted)
+
+
+def _foreign(
+    doubtful: list[str], edges: dict[str, _Edges], fits: dict[str, float], renders: list[list[Array]]
+) -> list[str]:
+    """Return those of the doubtful AOVs that should fit the picture. ``renders``: differences of both renders."""
+    if not doubtful:
+        return []
+    # If shapes are seen, so are colours. Even light shows colours without shapes.
+    if doubtful != [ALBEDO] or fits.get(NORMAL, 0) < SAME_FRAME:
+        first, second = (_Edges.of(np.minimum(_length(differences), 1)) for differences in renders)
+        if first.fit(second) < VISIBLE:
+            return []
+    if len(edges) == 2 and len(doubtful) == 1 and edges[ALBEDO].fit(edges[NORMAL]) > SAME_FRAME:
+        return []  # one AOV fits the picture, and the second one fits the first
+    return [*doubtful]
 
 
 def _are_noise(edges: Array, noise: Array) -> bool:
@@ -123,6 +146,16 @@ class _Edges:
         """Return by how many standard deviations two pictures fit better than with a shift."""
         return _above_control(np.conj(self.spectrum) * picture.spectrum, self.shape)
 
+    def shift_of(self, aov: _Edges) -> tuple[int, int] | None:
+        """Return the shift (x, y) with which an AOV's edges fit these clearly better, or None."""
+        window = _correlation(np.conj(self.spectrum) * aov.spectrum, self.shape)
+        fits = (window - _control(window).mean()) / max(float(_control(window).std()), 1e-30)
+        row, column = np.unravel_index(fits.argmax(), fits.shape)
+        furthest = CONTROL[1]
+        if fits.max() < SHIFTED or fits.max() - fits[furthest, furthest] < BY:
+            return None
+        return int(column) - furthest, int(row) - furthest
+
     def repeat_in(self, picture: _Edges) -> bool:
         """Return whether ``picture`` has a pattern of these edges that repeats, as boards or tiles do.
 
@@ -151,9 +184,15 @@ def _correlation(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) 
     return correlation[: 2 * furthest + 1, : 2 * furthest + 1]
 
 
-def _above_control(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> float:
-    nearest, furthest = CONTROL
-    window = _correlation(spectrum, shape)
+def _control(window: Array) -> Array:
+    """Return the correlations at the shifts of the control."""
+    furthest = CONTROL[1]
     y, x = np.abs(np.mgrid[-furthest : furthest + 1, -furthest : furthest + 1])
-    control = window[np.maximum(x, y) >= nearest]
-    return float((window[furthest, furthest] - control.mean()) / max(float(control.std()), 1e-30))
+    control: Array = window[np.maximum(x, y) >= CONTROL[0]]
+    return control
+
+
+def _above_control(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> float:
+    window = _correlation(spectrum, shape)
+    control = _control(window)
+    return float((window[CONTROL[1], CONTROL[1]] - control.mean()) / max(float(control.std()), 1e-30))

@@ -15,14 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.image.arrays import Array, quantile
+from oiio_msspl.fusion.checks.likeness import BETTER, Fit, fine_fits, fits_at_all, fits_better, mirrored, tone_mapped
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import blurred, box_downsample, interpolate
 
-#: A framing counts only if the smoothed pictures, moved by it, correlate at least this much.
-FRAMING_CORRELATION = 0.8
-#: It must also explain this fraction of the difference that tone curve and blur leave, because noise looks like a shift
-#: in a picture with few edges. In a large picture noise explains less, and the second number is enough, in pixels.
-MIN_EXPLAINED, MIN_EXPLAINED_PIXELS = 0.3, 2000
+#: A framing counts if the pictures, moved by it, fit clearly better. In a picture with few edges, noise looks like a
+#: shift. If it explains this fraction of the difference that tone curve and blur leave, a little better is enough. In
+#: a large picture noise explains less, and the second number is enough, in pixels.
+MIN_EXPLAINED, MIN_EXPLAINED_PIXELS = 0.2, 3000
 #: A difference must be this many standard errors from none.
 CERTAIN = 8.0
 #: The frame is cut into this many parts along each side. Each part is left out once to estimate standard errors.
@@ -49,31 +49,46 @@ class Framing:
     """Growth of the HRLS's picture: 0.03 for 3 %."""
     zoom_at_edge: float = 0.0
     """Pixels of the LRHS by which the zoom moves the edge of the area in which it was measured."""
+    mirrored: str | None = None
+    """How one of the two is mirrored; None if it is not."""
+    judged: bool = False
+    """Enough structure is common to both for a difference to be seen."""
 
 
 def find_framing(low: Array, high: Array) -> Framing:
     """Find the framing of the HRLS against the LRHS, both luminance (h, w)."""
-    if min(low.shape) < SMALLEST:
-        return Framing()
-    low, high = central_area(low), central_area(high)
-    grey = quantile(low[low > 0], 0.5) if low.any() else 1.0
-    # Map radiance to [0, 1], so neither fireflies nor black pixels dominate.
-    low, high = (blurred(v / (v + grey), 2) for v in (low, high))
+    low, high = tone_mapped(central_area(low), central_area(high))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return Framing()  # radiance near the limit of float32
-    starts = [np.zeros(3)]
+    before = fine_fits(low, high)
+    if (how := mirrored(before)) is not None:
+        return Framing(mirrored=how, judged=True)
+    if min(low.shape) < SMALLEST:
+        return Framing()
+    smooth_low, smooth_high = blurred(low, 2), blurred(high, 2)
+    fits = [_fit(smooth_low, smooth_high, start) for start in _starts(smooth_low, smooth_high, before)]
+    fit = max(fits, key=lambda fit: fit.explained)
+    after = fine_fits(_move(low, fit.estimate / (1, 1, max(low.shape) / 2)), high)
+    explains = fit.explained >= min(MIN_EXPLAINED, MIN_EXPLAINED_PIXELS / low.size)
+    if not fits_better(before, after, certain=not explains):
+        return Framing(judged=fits_at_all(before))
+    x, y, at_edge = np.where(np.abs(fit.estimate) > CERTAIN * fit.error, fit.estimate, 0)
+    return Framing(float(x), float(y), float(at_edge / (max(low.shape) / 2)), float(at_edge), judged=True)
+
+
+def _starts(low: Array, high: Array, fits: list[Fit]) -> list[NDArray[np.float64]]:
+    """Return estimates to start from: none, the shifts that fit best, and an estimate at a quarter of the size."""
+    starts = [np.zeros(3), *(np.array([*fit.best, 0.0]) for fit in fits if fit.best_fit >= BETTER)]
     if min(low.shape) >= SMALLEST_COARSE:
         height, width = (n // 4 * 4 for n in low.shape)
         low_4, high_4 = (blurred(box_downsample(v[:height, :width], 4), 2) for v in (low, high))
-        coarse = _fit(low_4, high_4, np.zeros(3)).estimate * 4
-        # A start less than half a pixel away would lead to the same result.
-        if np.abs(coarse).max() >= 0.5:
-            starts.append(np.clip(coarse, -12, 12))
-    fit = max((_fit(low, high, start) for start in starts), key=lambda fit: fit.explained)
-    if fit.correlation < FRAMING_CORRELATION or fit.explained < min(MIN_EXPLAINED, MIN_EXPLAINED_PIXELS / low.size):
-        return Framing()
-    x, y, at_edge = np.where(np.abs(fit.estimate) > CERTAIN * fit.error, fit.estimate, 0)
-    return Framing(float(x), float(y), float(at_edge / (max(low.shape) / 2)), float(at_edge))
+        starts.append(np.clip(_fit(low_4, high_4, np.zeros(3)).estimate * 4, -12, 12))
+    # Starts less than half a pixel from each other lead to the same result.
+    chosen: list[NDArray[np.float64]] = starts[:1]
+    for start in starts[1:]:
+        if min(np.abs(start - other).max() for other in chosen) >= 0.5:
+            chosen.append(start)
+    return chosen
 
 
 @dataclass(frozen=True)
@@ -84,7 +99,6 @@ class _Fit:
     """Standard error of ``estimate``."""
     explained: float
     """Fraction of the squared difference left by tone curve and blur that shift and zoom explain."""
-    correlation: float
 
 
 def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
@@ -119,9 +133,7 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
     error = jackknife_error(without_part)
     residual = float(dots[:, -1, -1].sum() - step @ products.sum(0))
     explained = 1 - residual / max(_unmoved_residual(low, high, inner), 1e-30)
-    a, b = (v[inner, inner] - v[inner, inner].mean() for v in (moved, high))
-    correlation = float(np.mean(a * b)) / max(float(a.std() * b.std()), 1e-12)
-    return _Fit(estimate, error, explained, correlation)
+    return _Fit(estimate, error, explained)
 
 
 def _unmoved_residual(low: Array, high: Array, inner: slice) -> float:
@@ -144,12 +156,12 @@ def _move(values: Array, by: NDArray[np.float64]) -> Array:
 
 def central_area(values: Array) -> Array:
     """Return the middle of a picture (h, w), at most `AREA` pixels wide and high."""
-    return values[central_slices(values.shape)]
+    return values[central_slices(values.shape, AREA)]
 
 
-def central_slices(shape: tuple[int, int]) -> tuple[slice, slice]:
-    """Return rows and columns of the middle of a picture, at most `AREA` of each."""
-    rows, columns = (slice(max(0, n - AREA) // 2, min(n, (n + AREA) // 2)) for n in shape)
+def central_slices(shape: tuple[int, int], side: int) -> tuple[slice, slice]:
+    """Return rows and columns of the middle of a picture, at most ``side`` of each."""
+    rows, columns = (slice(max(0, n - side) // 2, min(n, (n + side) // 2)) for n in shape)
     return rows, columns
 
 

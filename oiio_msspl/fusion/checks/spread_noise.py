@@ -8,6 +8,7 @@ and denoisers that learnt from independent pixels take it for detail.
 from __future__ import annotations
 
 import functools
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +22,17 @@ from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance, find_exposure
 
+T = TypeVar("T", bound=np.generic)
+
 #: Side of the blocks in which neighbouring pixels are compared; and of a sample of the frame, in LRHS pixels.
 BLOCK, SAMPLE = 8, 32
 #: Samples along each side of the frame.
 SAMPLES = 3
 #: The fewest blocks with noise for a judgement.
 FEWEST = 4
+#: A block has noise if this fraction of its pixels differ between both renders by more than rounding does, log-encoded.
+#: Without noise they differ along edges, where samples of a pixel fall on either side.
+DENSE, ROUNDING = 0.5, 1e-3
 #: Bytes of decoded rows that neighbouring samples share.
 CACHE_BYTES = 256 << 20
 #: Noise is spread if neighbouring pixels of the HRLS, and of the difference between both renders, correlate by more.
@@ -56,7 +62,9 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
                 encode_radiance(luminance(image)[..., None], exposure)[..., 0]
                 for image in (box_downsample(high, scale), low, high)
             )
-            correlations.append((_correlations(high), _correlations(low - mean)))
+            difference = low - mean
+            dense = _blocks(np.abs(difference) > ROUNDING).mean(axis=1) > DENSE
+            correlations.append((_correlations(_blocks(high)), _correlations(_blocks(difference)[dense])))
     hrls, difference = (np.concatenate(parts) for parts in zip(*correlations, strict=True))
     if lr is hr:
         return None if len(hrls) < FEWEST else bool(np.quantile(hrls, LEAST_CORRELATED) > SPREAD_HRLS)
@@ -76,11 +84,16 @@ def _samples(grid: Window) -> list[Window]:
     return [Window(x, y, x + width, y + height) for y in rows for x in columns]
 
 
-def _correlations(image: Array) -> NDArray[np.float64]:
-    """Return the correlation of neighbouring pixels in each block of an image (h, w), without its smooth course."""
+def _blocks(image: NDArray[T]) -> NDArray[T]:
+    """Return the whole blocks of an image (h, w), (n, BLOCK^2)."""
     rows, columns = (side // BLOCK for side in image.shape)
-    blocks = image[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2)
-    residual = (blocks.reshape(-1, BLOCK**2).astype(np.float64) @ _without_course()).reshape(-1, BLOCK, BLOCK)
+    blocks = image[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
+    return blocks.swapaxes(1, 2).reshape(-1, BLOCK**2)
+
+
+def _correlations(blocks: Array) -> NDArray[np.float64]:
+    """Return the correlation of neighbouring pixels in each block (n, BLOCK^2), without its smooth course."""
+    residual = (blocks.astype(np.float64) @ _without_course()).reshape(-1, BLOCK, BLOCK)
     residual = residual[residual.var(axis=(1, 2)) > 1e-8]  # black and blown-out blocks have no noise
     across = (residual[:, :, 1:] * residual[:, :, :-1]).mean(axis=(1, 2))
     down = (residual[:, 1:] * residual[:, :-1]).mean(axis=(1, 2))

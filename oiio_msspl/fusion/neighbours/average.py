@@ -81,8 +81,8 @@ def average_renders(
         return RenderBand(pair, light, low, high, core, area)
 
     frames = _average(alignment, light, before, after, band, _weight(sum(image.shape[-1] for image in high.values())))
-    hr = _replaced(pair.hr, high)
-    return hr if pair.is_one_render else _replaced(pair.lr, low), hr, frames
+    hr = _replaced(pair.hr, high, window)
+    return hr if pair.is_one_render else _replaced(pair.lr, low, alignment.lr_data_window), hr, frames
 
 
 def average_results(
@@ -161,5 +161,6 @@ def _weight(channels: int) -> float:
     return max(1.0, needed / usual)
 
 
-def _replaced(render: ReadableRender, layers: Features) -> Render:
-    return Render(layers, render.data_window, render.display_window, render.pixel_aspect, name=render.name)
+def _replaced(render: ReadableRender, layers: Features, window: Window) -> Render:
+    display = render.display_window
+    return Render(layers, window.shift(display.x0, display.y0), display, render.pixel_aspect, name=render.name)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
 from oiio_msspl.exr.render import ReadableRender, Render, Window
-from oiio_msspl.fusion.checks.pair import bounded_luminance
+from oiio_msspl.fusion.checks.averages import bounded_luminance
 from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
 from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness

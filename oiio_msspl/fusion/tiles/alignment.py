@@ -2,7 +2,7 @@
 """The alignment of a pair: how its pixels lie over each other.
 
 It follows from the display windows: the low-resolution frame shows the same picture with 1/s of the pixels. The data
-windows say which part of the frame was rendered (overscan, crop region).
+windows say which part of the frame was rendered (overscan, crop region), or which part is not empty.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Alignment:
     grid: Window
     """The LRHS pixels that cover the HRLS's data window: the area that is fused."""
     lr_data_window: Window
-    """The LRHS's data window."""
+    """The LRHS pixels that are known: its data window, or the whole frame, which is black and transparent around it."""
     hr_data_window: Window
     """The HRLS's data window: the area that is written."""
     stretch: tuple[float, float] = (1.0, 1.0)
@@ -35,6 +35,9 @@ def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
     An HRLS of odd size (1921 x 1081) may come with an LRHS that is rounded up or down (961 x 541 or 960 x 540).
     Renderers fit the whole frame into either size, so an LRHS pixel is not exactly s HRLS pixels wide: ``stretch`` is
     the ratio. The pixel aspects are equal, or differ by that ratio, so that both frames have one shape.
+
+    Programs that crop a data window to what is not empty crop two noisy renders differently. So an LRHS that does not
+    cover the HRLS's data window is black and transparent in the rest of the frame, as OpenEXR defines it.
 
     Raises:
         InputError: the inputs are swapped, or their pixel aspects, framing or sizes do not fit.
@@ -51,14 +54,20 @@ def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
     lr_data = lr.data_window.shift(-low.x0, -low.y0)
     hr_data = hr.data_window.shift(-high.x0, -high.y0)
     grid = Window(hr_data.x0 // scale, hr_data.y0 // scale, -(-hr_data.x1 // scale), -(-hr_data.y1 // scale))
-    missing = max(lr_data.x0 - grid.x0, lr_data.y0 - grid.y0, grid.x1 - lr_data.x1, grid.y1 - lr_data.y1)
-    if missing > 1:  # odd sizes and crop regions may be rounded by one pixel
+    if _missing(grid, lr_data) > 1:  # odd sizes and crop regions may be rounded by one pixel
+        lr_data = lr_data.union(low.shift(-low.x0, -low.y0))
+    if _missing(grid, lr_data) > 1:
         raise InputError(
             f"framing differs: {hr.name} covers {hr_data} of its frame, which needs {grid} of the low-resolution "
             f"frame, but {lr.name} covers only {lr_data}; render both with the same crop region and overscan"
         )
     stretch = (low.width * scale / high.width, low.height * scale / high.height)
     return Alignment(scale, grid, lr_data, hr_data, stretch)
+
+
+def _missing(needed: Window, window: Window) -> int:
+    """Return by how many pixels ``needed`` exceeds a window."""
+    return max(window.x0 - needed.x0, window.y0 - needed.y0, needed.x1 - window.x1, needed.y1 - window.y1)
 
 
 def _shape(render: ReadableRender) -> float:

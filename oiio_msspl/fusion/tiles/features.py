@@ -15,7 +15,7 @@ from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, repair
-from oiio_msspl.image.filters import box_downsample, enlarged, filled, interpolate, max_3x3
+from oiio_msspl.image.filters import box_downsample, enlarged, filled, grown, in_squares, interpolate, max_3x3
 
 Indices = NDArray[np.int64]
 T = TypeVar("T", bound=np.generic)
@@ -26,6 +26,9 @@ SIGNED_FEATURES = {NORMAL}
 #: render, except for rare light (:mod:`oiio_msspl.fusion.tiles.guards`). The LRHS is the mean of s x s HRLS pixels, so
 #: s^2 would be the exact bound without noise. 64 leaves room for the noise of the LRHS.
 FIREFLY_FACTOR = 64.0
+#: A bucket that failed spans at least this many HRLS pixels and LRHS pixels on a side, and this fraction of the other
+#: render's pixels is lit there. If fewer are, or in smaller squares, rare light may miss all pixels by chance.
+BUCKET_HRLS, BUCKET_LRHS, BUCKET_LIT = 16, 4, 0.75
 
 
 @dataclass
@@ -66,6 +69,8 @@ class TileFeatures:
     """Rows and columns of ``lrhs`` that are inside the alignment's grid. Others only fill the tile up to its size."""
     hrls_is_lost: bool = False
     """All pixels of the HRLS's beauty are broken, so it is filled from the LRHS."""
+    failed: tuple[Mask, Mask] | None = None
+    """LRHS pixels (h, w) in buckets that failed, of the LRHS and of the HRLS; None if there are none."""
 
 
 def read_tile(
@@ -79,7 +84,7 @@ def read_tile(
 ) -> TileFeatures:
     """Read both renders over a tile.
 
-    Where the beauty of one render is broken, it gets the light of the other render.
+    Where the beauty of one render is broken, or a bucket failed, it gets the light of the other render.
 
     Args:
         lrhs: features of the LRHS over ``grid``, see :func:`read_lrhs`.
@@ -98,10 +103,21 @@ def read_tile(
     lost |= broken.get(RGB, False)
     if lost.any():
         hrls[RGB] = np.where(lost[..., None], enlarged(low[RGB], scale), hrls[RGB])
+    failed = _failed_buckets(low[RGB], hrls[RGB], scale)
+    if failed is not None:
+        in_bucket = grown(failed[1]).repeat(scale, axis=0).repeat(scale, axis=1)
+        dead = in_bucket & _is_dead(hrls[RGB])
+        hrls[RGB] = np.where(dead[..., None], enlarged(low[RGB], scale), hrls[RGB])
+        for name in hrls.keys() - {RGB}:
+            hrls[name] = filled(hrls[name], in_bucket & ~hrls[name].any(axis=-1))
+        lost |= dead
     lost_below = _infinite(low[RGB])
-    if lost_below.any():
+    if failed is not None or lost_below.any():
         means = box_downsample(hrls[RGB], scale)
-        low[RGB] = np.where((lost_below & ~_as_bright(means))[..., None], means, low[RGB])
+        lost_below &= ~_as_bright(means)
+        if failed is not None:
+            lost_below |= failed[0]
+        low[RGB] = np.where(lost_below[..., None], means, low[RGB])
     return TileFeatures(
         lrhs=low,
         hrls=hrls,
@@ -112,7 +128,34 @@ def read_tile(
         core=tile.core.intersect(alignment.grid).slices(tile.area),
         inside=tile.area.intersect(alignment.grid).slices(tile.area),
         hrls_is_lost=bool(lost.all()),
+        failed=failed,
     )
+
+
+def _failed_buckets(low: Array, high: Array, scale: int) -> tuple[Mask, Mask] | None:
+    """Return the LRHS pixels (h, w) in buckets that failed, of the LRHS and of the HRLS; None if there are none.
+
+    One render is dead in a whole square, and hardly a pixel of the other render is.
+    """
+    dead_low, dead_high = _is_dead(low), _is_dead(high)
+    if not dead_low.any() and not dead_high.any():
+        return None
+    dead_high = np.asarray(dead_high.reshape(len(low), scale, -1, scale).all(axis=(1, 3)))
+    side = bucket_side(scale)
+    low_alone = in_squares(dead_low, ~dead_high, side, BUCKET_LIT)
+    high_alone = in_squares(dead_high, ~dead_low, side, BUCKET_LIT)
+    return (low_alone, high_alone) if low_alone.any() or high_alone.any() else None
+
+
+def bucket_side(scale: int) -> int:
+    """Return the side of the smallest bucket that is noticed, in LRHS pixels."""
+    return max(BUCKET_LRHS, BUCKET_HRLS // scale)
+
+
+def _is_dead(rgb: Array) -> Mask:
+    """Return the pixels (h, w) without green whose red and blue are equal: black, or magenta as of missing shaders."""
+    dead: Mask = (rgb[..., 1] == 0) & (rgb[..., 0] == rgb[..., 2])
+    return dead
 
 
 def _infinite(rgb: Array) -> Mask:

@@ -42,6 +42,21 @@ def test_black_and_flat_frames_tell_nothing(light):
     assert is_noise_spread(*pair, align(*pair)) is None
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_flat_colours_with_crisp_edges_have_no_noise(seed):
+    """Along an edge the renders differ, because samples of a pixel fall on either side."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:256, :256] * 4
+
+    def render(size, spp):
+        rows, columns = (v[::size, ::size] + 4 * size * rng.random((spp, 256 // size, 256 // size)) for v in (y, x))
+        disc, ground = np.hypot(rows - 400, columns - 400) < 250, rows > 800 + columns / 3
+        return Render.from_arrays("r", rgb=(0.2 + 0.5 * disc + 0.2 * ground).mean(0)[..., None].repeat(3, -1))
+
+    lr, hr = render(4, 16), render(1, 1)
+    assert is_noise_spread(lr, hr, align(lr, hr)) is None
+
+
 def test_frames_without_noise_are_not_spread():
     for clean in (picture(300, 200), np.zeros((64, 64, 3), np.float32), np.ones((6, 6, 3), np.float32)):
         pair = Render.from_arrays("lr", rgb=box_downsample(clean, 2)), Render.from_arrays("hr", rgb=clean)

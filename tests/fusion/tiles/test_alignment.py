@@ -38,6 +38,13 @@ def test_crop_regions_and_overscan_are_mapped_to_low_resolution_pixels():
     assert align(low, high).grid == Window(-1, 2, 18, 9)
 
 
+def test_a_render_is_empty_outside_of_its_data_window():
+    """Data windows that are cropped to what is not empty differ between two noisy renders."""
+    alignment = align(render("lr", 16, 16, Window(3, 4, 9, 9)), render("hr", 64, 64, Window(8, 12, 40, 44)))
+    assert alignment.grid == Window(2, 3, 10, 11)
+    assert alignment.lr_data_window == Window(0, 0, 16, 16)
+
+
 def test_display_windows_may_begin_anywhere():
     high = render("hr", 64, 64, Window(100, 100, 164, 164), origin=(100, 100))
     low = render("lr", 16, 16, Window(-5, 0, 11, 16), origin=(-5, 0))
@@ -53,7 +60,7 @@ def test_display_windows_may_begin_anywhere():
         (render("lr.exr", 20, 20), render("hr.exr", 60, 60), r"ratio of 3 is not supported .* one of 30x30 \(x2\)"),
         (render("lr.exr", 16, 9), render("hr.exr", 32, 32), "framing differs: the ratio is 2 in width and 3.56"),
         (render("lr.exr", 16, 16), render("hr.exr", 32, 32, aspect=2), "pixel aspect 1, hr.exr has 2"),
-        (render("lr.exr", 16, 16, Window(0, 0, 8, 16)), render("hr.exr", 32, 32), "covers only 8x16"),
+        (render("lr.exr", 16, 16), render("hr.exr", 32, 32, Window(-8, 0, 32, 32)), "covers only 16x16"),
     ],
 )
 def test_what_does_not_fit_is_explained(low, high, message):

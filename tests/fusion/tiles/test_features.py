@@ -108,3 +108,55 @@ def test_images_are_mirrored_as_often_as_a_window_reaches(window, layout):
     result = mirrored(image, inside, window)
     np.testing.assert_array_equal(result, there)
     np.testing.assert_array_equal(np.argsort(result.strides), np.argsort(image.strides))
+
+
+def bucket_pair(scale, which, colour, part=(slice(16, 48), slice(64, 112))):
+    """A noisy pair with alpha, and rows and columns of HRLS pixels in which one render shows one colour alone."""
+    clean = picture(96, 128)
+    low, high = noisy(box_downsample(clean, scale), 4 * scale**2), noisy(clean, 4, seed=1)
+    alpha = np.ones((*high.shape[:2], 1), np.float32)
+    if which == "HRLS":
+        high[part], alpha[part] = colour, 0
+    else:
+        low[tuple(slice(p.start // scale, p.stop // scale) for p in part)] = colour
+    return Render.from_arrays("lr", rgb=low), Render.from_arrays("hr", rgb=high, alpha=alpha)
+
+
+def read(low, high):
+    alignment = align(low, high)
+    lrhs = read_lrhs(low, alignment, alignment.grid, ["rgb"])
+    return read_tile(Tile(alignment.grid, alignment.grid), lrhs, alignment.grid, high, alignment, ["rgb", "alpha"])
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+@pytest.mark.parametrize("which", ["LRHS", "HRLS"])
+@pytest.mark.parametrize("colour", [(0, 0, 0), (1, 0, 1)])
+def test_a_failed_bucket_gets_the_light_of_the_other_render(scale, which, colour):
+    low, high = bucket_pair(scale, which, colour)
+    pair = read(low, high)
+    inside = (slice(16 // scale, 48 // scale), slice(64 // scale, 112 // scale))
+    failed = pair.failed[which == "HRLS"]
+    assert failed[inside].all() and failed.sum() == failed[inside].size
+    means = box_downsample(pair.hrls["rgb"], scale)
+    if which == "HRLS":
+        np.testing.assert_allclose(means[inside].mean(), low.layers["rgb"][inside].mean(), rtol=0.05)
+        assert (pair.hrls["alpha"] == 1).all()
+    else:
+        np.testing.assert_array_equal(pair.lrhs["rgb"][inside], means[inside])
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_what_is_black_is_no_bucket_without_a_reason(scale):
+    """Rare light, a thing that is black in both renders, and a square smaller than any bucket."""
+    rng = np.random.default_rng(0)
+    clean = picture(256, 256)
+    for n in (1, 4):
+        high = clean / 0.05 * (rng.random((n, 256, 256, 1)) < 0.05).mean(axis=0)
+        low = box_downsample(clean / 0.05 * (rng.random((n, 256, 256, 1)) < 0.05).mean(axis=0), scale)
+        pair = read(Render.from_arrays("lr", rgb=low.astype(np.float32)), Render.from_arrays("hr", rgb=high))
+        assert pair.failed is None
+    clean[64:192, 64:192] = 0
+    high = clean.copy()
+    high[8:16, 8:16] = 0
+    low = Render.from_arrays("lr", rgb=box_downsample(clean, scale))
+    assert read(low, Render.from_arrays("hr", rgb=high)).failed is None

@@ -32,7 +32,7 @@ def box_downsample(image: NDArray[Any], scale: int) -> Array:
         np.clip(sums, -FLOAT_MAX, FLOAT_MAX, out=sums)
         np.multiply(sums, np.float32(1 / scale**2), out=result[rows.start // scale : rows.stop // scale])
 
-    for_row_blocks(work, height, image[0].size, multiple=scale)
+    for_row_blocks(work, height, image[:1].size, multiple=scale)
     return result
 
 

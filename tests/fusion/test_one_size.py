@@ -74,9 +74,9 @@ def test_two_renders_without_noise_are_no_mistake():
 
 def test_renders_of_other_frames_are_doubted():
     first, second = (Render.from_arrays(f"seed {seed}", **layers(spp=16, seed=seed)) for seed in (1, 2))
-    assert check_renders(first, second) == []
+    assert check_renders(first, second).warnings == []
     shifted = Render.from_arrays("b", rgb=np.roll(second.layers["rgb"], 9, axis=1))
-    (warning,) = check_renders(first, shifted)
+    (warning,) = check_renders(first, shifted).warnings
     assert "shifted" in warning and "LRHS" not in warning
 
 

@@ -198,7 +198,7 @@ def _by_chance(pixels: Array, scale: int) -> bool:
 def _judge_noise(judgement: Judgement, low: Array, hrls: HrlsAverages) -> None:
     noisy, equal = hrls.blocks[..., 6:].sum(axis=(0, 1))
     middle, quarters = low[central_slices(low.shape, MIDDLE)], hrls.quarters
-    if hrls.alignment.scale == ONE_SIZE:
+    if hrls.alignment.scale == ONE_SIZE and min(middle.shape) > 1:
         middle, quarters = _halved(middle), quarters[: len(quarters) // 2 * 2, : quarters.shape[1] // 2 * 2]
     same, judgement.independent = compare_noise(middle, quarters)
     if same or (noisy >= MIN_NOISY_PIXELS and equal > EQUAL_PIXELS * noisy):

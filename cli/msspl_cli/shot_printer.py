@@ -111,6 +111,8 @@ def _print_table(report: ShotReport) -> None:
 
     for name, outcome in (report.first or {}).get("passes", {}).items():
         console.say(f"{name}: {outcome}")
+    if report.temporal and any(result.status == "fused" for result in report.results.values()):
+        console.say(f"Fused {report.temporal_text}")
     # Sentences that differ only in their numbers share a row, which shows the first of them.
     groups: dict[tuple[str, str], tuple[list[int], str]] = {}
     for frame in report.shot.frames:

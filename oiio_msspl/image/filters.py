@@ -37,15 +37,15 @@ def box_downsample(image: NDArray[Any], scale: int) -> Array:
 
 
 def even_and_odd(plane: Array) -> tuple[Array, Array]:
-    """Return two pictures of one (h, w), by its even and by its odd pixels, as on a chessboard.
+    """Return two pictures of one (h, w, ...), by its even and by its odd pixels, as on a chessboard.
 
     Where a picture lacks a pixel, it is the mean of the four pixels around. So the noise of the two is independent if
     that of the pixels is.
     """
-    padded = np.pad(plane, 1, mode="edge")
+    padded = np.pad(plane, [(1, 1), (1, 1), *[(0, 0)] * (plane.ndim - 2)], mode="edge")
     around = (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]) * np.float32(0.25)
     rows, columns = np.ogrid[: plane.shape[0], : plane.shape[1]]
-    is_even = (rows + columns) % 2 == 0
+    is_even = ((rows + columns) % 2 == 0).reshape(*plane.shape[:2], *[1] * (plane.ndim - 2))
     return np.where(is_even, plane, around), np.where(is_even, around, plane)
 
 

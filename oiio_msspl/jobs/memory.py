@@ -28,8 +28,8 @@ from oiio_msspl.model.session import Session
 #: Bytes of a pixel: a fused frame with alpha and the expected error; a vector, whether it is believed, and
 #: whether an object has moved that it does not follow; and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 20, 10, 20
-#: Bytes that luminance takes for each frame that is held: of an LRHS pixel for both renders, and of an HRLS pixel.
-LUMINANCE_BYTES, HRLS_LUMINANCE_BYTES = 8, 4
+#: Bytes of an LRHS pixel for both renders: their colours while they wait, and their luminance while a fused frame does.
+COLOUR_BYTES, LUMINANCE_BYTES = 24, 8
 #: Bytes of a pixel for each channel of motion vectors that is read: as stored, decoded, and compared with zero.
 READ_VECTOR_BYTES = 12
 
@@ -164,11 +164,11 @@ def waiting_to_average(reach: Reach, window: Window, channels: int, scale: int) 
     pixels = window.width * window.height
     held = 2 * reach.results * FRAME_BYTES + 4 * reach.frames * VECTOR_BYTES
     if reach.renders:
-        held += 4 * channels + (2 * reach.renders + 2) * HRLS_LUMINANCE_BYTES
+        held += 4 * channels
     if has_many_pixels(window.height, window.width):  # what is large waits in temporary files
         held = 0
-    luminance = LUMINANCE_BYTES * (2 * reach.frames + 2) * pixels // scale**2
-    return (held + RESULT_BYTES) * pixels + luminance
+    both = COLOUR_BYTES * (2 * reach.renders + 2) + LUMINANCE_BYTES * (2 * reach.results + 2)
+    return (held + RESULT_BYTES) * pixels + both * pixels // scale**2
 
 
 def memory_to_write(alignment: Alignment, hr: MappedRender, write: WriteOptions) -> int:

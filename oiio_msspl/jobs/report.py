@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO
@@ -61,6 +63,8 @@ class FrameReport:
     """A sentence on each additive set, by name: fused or passed on."""
     trust: float | None = None
     """Mean share of what the network had removed and was put back because both renders show it; None without trust."""
+    frames_counted: float | None = None
+    """How many frames a pixel is the mean of, in the mean over the first view; None without neighbours."""
     network_seconds: float = 0.0
     """``seconds["network"]``, known before the others."""
     other_views: list[FrameReport] = field(default_factory=list)
@@ -136,6 +140,7 @@ class FrameReport:
             "clipped": self.clipped,
             "trust": None if self.trust is None else round(self.trust, 4),
             "warnings": self.warnings,
+            "frames_counted": None if self.frames_counted is None else round(self.frames_counted, 2),
             "tiles": self.tiles,
             "seconds": {k: round(v, 3) for k, v in self.seconds.items()},
             "version": __version__,
@@ -169,6 +174,7 @@ def report_on(
         lrhs_aovs=tuple(session.contract.lrhs[1:]),
         passes=_passes(fused),
         trust=None if fused.trust is None else float(fused.trust.mean()),
+        frames_counted=None if fused.frames is None else float(fused.frames.mean(dtype=np.float64)),
         network_seconds=fused.seconds,
         fused_sets=fused.passes.sets if fused.passes else [],
     )

@@ -21,6 +21,9 @@ from oiio_msspl.jobs.sequence import FrameFiles, Shot
 #: frames are compared with the first one that this run fuses.
 FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "size", "scale", "model", "aovs", "layers", "notes", "passes"}
 
+#: A frame stands alone if a pixel counts fewer frames than this, in the mean.
+ALONE = 1.1
+
 #: The most layers that a warning names.
 MOST_NAMES = 6
 
@@ -49,6 +52,8 @@ class FrameResult:
     """Number of values that were NaN or infinite, by layer."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Seconds by stage, as in :class:`oiio_msspl.jobs.report.FrameReport`. Neighbouring frames overlap in time."""
+    frames_counted: float | None = None
+    """How many frames a pixel is the mean of, in the mean over the frame; None if nothing was averaged."""
     lrhs: str | None = None
     hrls: str | None = None
     output: str = ""
@@ -87,6 +92,18 @@ class ShotReport:
         return 1 if 1 in codes else max(codes, default=0)
 
     @property
+    def frames_counted(self) -> float | None:
+        """The mean of this number over the frames; None if nothing was averaged."""
+        counts = [result.frames_counted for result in self.results.values() if result.frames_counted is not None]
+        return sum(counts) / len(counts) if counts else None
+
+    @property
+    def temporal_text(self) -> str:
+        """``temporal``, and how many frames really counted."""
+        counted = self.frames_counted
+        return self.temporal + ("" if counted is None else f"; in the mean, a pixel counts {counted:.1f} frames")
+
+    @property
     def stage_seconds(self) -> dict[str, float]:
         """Seconds spent in each stage, summed over the fused frames. Stages overlap: the sum exceeds the wall time."""
         total: Counter[str] = Counter()
@@ -111,6 +128,7 @@ class ShotReport:
             "counts": {"all": count, **{status: counts[status] for status in STATUSES}},
             "seconds": {k: round(v, 3) for k, v in {"wall": self.seconds, **self.stage_seconds}.items()},
             "temporal": self.temporal,
+            "frames_counted": None if self.frames_counted is None else round(self.frames_counted, 2),
             "first_fused": self.first,
             "frames": entries,
             "version": __version__,
@@ -146,8 +164,12 @@ def fused_result(frame: FrameFiles, frame_report: dict[str, Any], report: ShotRe
     warnings, repaired = list(frame_report["warnings"]), frame_report["repaired"]
     if repaired:
         warnings.append(f"repaired values that were NaN or infinite in {', '.join(repaired)}")
+    counted = frame_report["frames_counted"]
+    if counted is not None and counted < ALONE:
+        warnings.append("its neighbours hardly count: their light or their surfaces differ from those of this frame")
     warnings += [f"{text} in frame {first['frame']}: it may flicker" for text in _differences(here, first)]
-    return result_of(frame, FUSED, warnings=warnings, repaired=repaired, seconds=frame_report["seconds"])
+    more = {name: frame_report[name] for name in ("repaired", "seconds", "frames_counted")}
+    return result_of(frame, FUSED, warnings=warnings, **more)
 
 
 def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
@@ -241,6 +263,7 @@ def read_earlier(
         data = json.loads(path.read_text(encoding="utf-8"))
         entries = {
             entry["frame"]: {name: entry[name] for name in ("repaired", "seconds")}
+            | {"frames_counted": entry.get("frames_counted")}
             | {"warnings": [text for text in entry["warnings"] if not _OLDER.fullmatch(text)]}
             for entry in data["frames"]
         }

@@ -6,9 +6,13 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
+import numpy as np
+
 from oiio_msspl.errors import InputError
-from oiio_msspl.fusion.motion.source import FLOW, STATIC, MotionFrame, MotionSource
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.motion.source import FLOW, STATIC, VECTORS, MotionFrame, MotionSource
 from oiio_msspl.image.arrays import Array, Mask, kept
+from oiio_msspl.image.sampling import nearest_indices
 
 #: A vector and the way back may differ by this, in HRLS pixels: by rounding, and by what vectors change within a pixel.
 #: Vectors of optical flow are estimates, so more is allowed.
@@ -39,49 +43,71 @@ class ShotMotion:
 
     def __init__(self, source: MotionSource) -> None:
         self._source = source
-        #: By the numbers of two frames: forwards and backwards; None if the vectors are 0 and can't be believed.
-        self._motions: dict[tuple[int, int], tuple[Motion, Motion] | None] = {}
+        #: By the numbers of two frames: forwards and backwards; or why the vectors can't be believed.
+        self._motions: dict[tuple[int, int], tuple[Motion, Motion] | str] = {}
 
     def between(self, here: MotionFrame, there: MotionFrame) -> tuple[Motion, Motion]:
         """Return the motion from a frame to the one before or after it, and back.
 
         Raises:
-            InputError: pixels can't be decoded, or vectors are 0 everywhere although the picture moves.
+            InputError: pixels can't be decoded, vectors are 0 everywhere although the picture moves, or they mislead.
         """
         # Always in the same order, so that pixels do not depend on which frame comes first.
         first, second = (here, there) if here.number < there.number else (there, here)
         numbers = first.number, second.number
         if numbers not in self._motions:
-            motions = self._read(first, second)
-            zero = any(m.vectors is None and (m.known is None or m.known.any()) for m in motions)
-            self._motions[numbers] = None if zero and not self._source.zeros_are_right(first, second) else motions
+            self._motions[numbers] = self._read(first, second)
         ways = self._motions[numbers]
-        if ways is None:
-            frames = f"frames {numbers[0]} and {numbers[1]}"
-            raise InputError(f"motion vectors between {frames} are 0, though the picture moves")
+        if isinstance(ways, str):
+            raise InputError(f"motion vectors between frames {numbers[0]} and {numbers[1]} {ways}")
         return ways if first is here else ways[::-1]
 
     def keep(self, numbers: Collection[int]) -> None:
         """Forget the motion of all frames but these."""
         self._motions = {pair: ways for pair, ways in self._motions.items() if set(pair) <= set(numbers)}
 
-    def _read(self, first: MotionFrame, second: MotionFrame) -> tuple[Motion, Motion]:
-        """Read the motion between two frames, forwards and backwards."""
-        source, forth = self._source, self._motion(first, second, 1)
+    def _read(self, first: MotionFrame, second: MotionFrame) -> tuple[Motion, Motion] | str:
+        """Read the motion between two frames, forwards and backwards; or what is wrong with it."""
+        source = self._source
+        forth, known = source.read(first, second, 1)
         # If nothing but objects moves, they have moved at the same pixels of both frames.
-        if source.kind == STATIC and not source.fields and first.hr.data_window == second.hr.data_window:
-            return forth, forth
-        return forth, self._motion(second, first, -1)
+        same = source.kind == STATIC and not source.fields and first.hr.data_window == second.hr.data_window
+        back, back_known = (forth, known) if same else source.read(second, first, -1)
+        zero = any(mask.any() and not way.any() for way, mask in ((forth, known), (back, back_known)))
+        if zero and not source.zeros_are_right(first, second):
+            return "are 0, though the picture moves"
+        if source.misleads(first, second, forth, known):
+            return "do not lead to the same surfaces"
+        objects = source.moved_objects(first, second, forth, known) if known.any() else None
+        if objects is not None and source.kind == VECTORS:
+            # Pixels are followed there and back, so one direction tells both. Where the way back leads elsewhere, the
+            # surface is only hidden.
+            hidden = objects & ~_leads_back(objects, forth, back, first.hr.data_window, second.hr.data_window)
+            return self._motion(forth, known & ~hidden, objects & ~hidden), self._motion(back, back_known, None)
+        there = self._motion(forth, known, objects)
+        if same:
+            return there, there
+        objects = source.moved_objects(second, first, back, back_known) if back_known.any() else None
+        return there, self._motion(back, back_known, objects)
 
-    def _motion(self, here: MotionFrame, there: MotionFrame, hop: int) -> Motion:
-        """Read the motion to a neighbour, and keep it as it waits for the frames that need it."""
-        vectors, known = self._source.read(here, there, hop)
-        objects = self._source.moved_objects(here, there, vectors, known) if known.any() else None
+    def _motion(self, vectors: Array, known: Mask, objects: Mask | None) -> Motion:
+        """Return a motion as it waits for the frames that need it."""
         if objects is not None:
-            known &= ~objects
+            known = known & ~objects
         return Motion(
             kept(vectors) if vectors.any() else None,
             None if known.all() else kept(known),
             kept(objects) if objects is not None and objects.any() else None,
             ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP,
         )
+
+
+def _leads_back(pixels: Mask, forth: Array, back: Array, window: Window, other: Window) -> Mask:
+    """Find the pixels of a mask (h, w) to which the vectors of the other frame lead back."""
+    result = np.zeros_like(pixels)
+    y, x = np.nonzero(pixels)
+    ways = forth[y, x]
+    at_x, at_y = x + ways[:, 0] + (window.x0 - other.x0), y + ways[:, 1] + (window.y0 - other.y0)
+    ends = back.reshape(-1, 2).take(nearest_indices(at_x, at_y, back.shape[:2]), axis=0)
+    result[y, x] = np.hypot(*(ways + ends).T) < ROUND_TRIP
+    return result

@@ -29,7 +29,7 @@ from oiio_msspl.fusion.motion.camera import Projection, camera_vectors, find_pro
 from oiio_msspl.fusion.motion.flow import flow_vectors, has_optical_flow
 from oiio_msspl.fusion.motion.formats import FEWEST, MARGIN, FieldCheck, check_field, is_silent
 from oiio_msspl.fusion.motion.guides import TwoFrames, has_guide, open_frames, still_and_moved
-from oiio_msspl.fusion.motion.surfaces import other_surfaces
+from oiio_msspl.fusion.motion.surfaces import misleads, other_surfaces
 from oiio_msspl.fusion.motion.vectors import invert, judged_vectors, no_vectors
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.parallel import in_parallel
@@ -126,21 +126,31 @@ class MotionSource:
         frames = open_frames(frame.hr, neighbour.hr, LOOK)
         return not frames.guides or _camera_stands(*still_and_moved(frames))
 
-    def moved_objects(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
-        """Find where an object has moved that :meth:`read` does not follow, so that the frames show other surfaces.
-
-        Returns:
-            (h, w) over the data window of ``frame``. None if the source follows all objects.
+    def misleads(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> bool:
+        """Return whether stored vectors contradict the albedo and the normals of two frames, see :func:`misleads`.
 
         Raises:
             InputError: pixels can't be decoded.
         """
-        if self.kind not in (STATIC, CAMERA):
-            return None
-        frames, moves = (frame, neighbour), self.kind == CAMERA
+        return self.kind == VECTORS and misleads(*self._compared(frame, neighbour), vectors, known)
+
+    def moved_objects(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
+        """Find where an object has moved that :meth:`read` does not follow, so that the frames show other surfaces.
+
+        Returns:
+            (h, w) over the data window of ``frame``. None if all motion is estimated from the pixels themselves.
+
+        Raises:
+            InputError: pixels can't be decoded.
+        """
+        return None if self.kind == FLOW else other_surfaces(*self._compared(frame, neighbour), vectors, known)
+
+    def _compared(self, frame: MotionFrame, neighbour: MotionFrame) -> tuple[ReadableRender, ReadableRender, list[str]]:
+        """Return the features of two frames, and the names of those that a surface keeps."""
+        frames, moves = (frame, neighbour), self.kind != STATIC
         names = [name for name in (ALBEDO, NORMAL) if all(has_guide(f.hr, name, moves=moves) for f in frames)]
         here, there = (f.pixels or f.hr for f in frames)
-        return other_surfaces(here, there, names, vectors, known)
+        return here, there, names
 
     def tells_more(self, hr: MappedRender) -> bool:
         """Return whether something moves in a frame along an axis that is :attr:`silent`.
@@ -240,10 +250,11 @@ def _find(
 def _checks(frames: TwoFrames, fields: Sequence[MotionField], verified: Mapping[str, MotionField]) -> list[FieldCheck]:
     """Verify layers by the pixels of both frames."""
     stored = in_parallel(*(partial(_stored, frames, index, fields) for index in (0, 1)))
-    return [
+    checks = (
         _check(frames, field, stored[0].get(field.name), stored[1].get(field.name), verified.get(field.name))
         for field in fields
-    ]
+    )
+    return [_try_premultiplied(frames, check) for check in checks]
 
 
 def _check(
@@ -261,6 +272,39 @@ def _check(
         fits = f"'{other.field.format}' explains {1 - other.fit:.0%} of what changes"
         return replace(check, problem=f"{fits}, and this {max(1 - check.fit, 0):.0%}")
     return replace(check, problem="", by_user=True) if check.problem and check.fit <= 1 else check
+
+
+def _try_premultiplied(frames: TwoFrames, check: FieldCheck) -> FieldCheck:
+    """Return the verdict on vectors that are multiplied by alpha, if they fit better where alpha is neither 0 nor 1.
+
+    Elsewhere they are the same.
+    """
+    field, alphas = check.field, (frames.first.alpha, frames.second.alpha)
+    if check.zero or field.format.premultiplied or not all(alphas):
+        return check
+    multiplied = replace(field, format=replace(field.format, premultiplied=True))
+    covers = [frames.read(index, [alpha]) for index, alpha in enumerate(alphas) if alpha]
+    parts = [(cover > 0) & (cover < 1) for cover in covers]
+    if min(np.count_nonzero(part) for part in parts) < FEWEST:
+        return check
+    as_stored, divided = (
+        [values for index in (0, 1) for values in _stored(frames, index, [form]).values()]
+        for form in (field, multiplied)
+    )
+    if len(divided) < len(covers):
+        return check
+    there = [
+        check_field(frames, form, (_only(stored[0], parts[0]), _only(stored[1], parts[1])))
+        for form, stored in ((field, as_stored), (multiplied, divided))
+    ]
+    if there[1].problem or (not there[0].problem and there[1].fit * MARGIN >= there[0].fit):
+        return check
+    return check_field(frames, multiplied, (divided[0], divided[1]))
+
+
+def _only(stored: Array, part: Mask) -> Array:
+    """Return vectors (h, w, 2) that are NaN outside of a mask (h, w, 1)."""
+    return np.where(part, stored, np.float32(np.nan))
 
 
 def _stored(frames: TwoFrames, index: int, fields: Sequence[MotionField]) -> dict[str, Array]:

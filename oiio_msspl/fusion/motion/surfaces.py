@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the pixels that show another surface in a neighbour, by the albedo and the normals of both frames.
+"""Verifies where motion leads to, by the albedo and the normals of both frames.
 
-Without motion vectors, nothing else says that an object has moved in front of a surface, or away from it.
+Pixels that show another surface in the neighbour are found: nothing else says that an object has moved which has no
+vectors, or wrong ones. And vectors that mislead all pixels are.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,6 +25,12 @@ DIFFERENCE, MULTIPLE = 0.03, 3.0
 PIXELS = 4
 #: Rows and columns around a pixel that decide on it.
 REACH = 4
+#: Pixels by which vectors are judged, at most, and at least.
+MOST_SAMPLES, FEWEST_SAMPLES = 16384, 64
+#: Vectors are judged where they are longer than this, in pixels.
+MOVES = 0.5
+#: Vectors mislead if a vote of the pixels is this many standard deviations from a tie.
+SURE = 4.0
 #: Pixels that are compared at a time, which bounds memory.
 PIXELS_AT_ONCE = 1 << 22
 
@@ -54,6 +62,54 @@ def other_surfaces(
         for render in (here, there):
             render.unload()
     return result
+
+
+def misleads(here: ReadableRender, there: ReadableRender, names: Sequence[str], vectors: Array, known: Mask) -> bool:
+    """Return whether no motion, or the opposite vectors, lead to more alike pixels of a neighbour than the vectors.
+
+    The arguments are those of :func:`other_surfaces`. A sample of the pixels votes (sign test).
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    window, other = here.data_window, there.data_window
+    step = max(3, int(np.sqrt(vectors[..., 0].size / MOST_SAMPLES)))  # apart, so that their noise is independent
+    part = slice(step // 2, None, step), slice(step // 2, None, step)
+    ways = vectors[part]
+    y, x = np.nonzero(known[part] & (np.hypot(ways[..., 0], ways[..., 1]) > MOVES))
+    ways, x, y = ways[y, x], x * step + step // 2, y * step + step // 2
+    places = [(x + window.x0 + sign * ways[:, 0], y + window.y0 + sign * ways[:, 1]) for sign in (1, 0, -1)]
+    inside = np.logical_and.reduce([_is_inside(place, other) for place in places])
+    if not names or np.count_nonzero(inside) < FEWEST_SAMPLES:
+        return False
+    votes = np.zeros((2, np.count_nonzero(inside)))
+    for own, image in zip(_layers(here, names, window), _layers(there, names, other), strict=True):
+        target = _means_at(own, *(places[1][axis][inside] - (window.x0, window.y0)[axis] for axis in (0, 1)))
+        errors = [
+            np.abs(_means_at(image, at_x[inside] - other.x0, at_y[inside] - other.y0) - target).sum(axis=-1)
+            for at_x, at_y in places
+        ]
+        votes += [np.sign(errors[0] - errors[rival]) for rival in (1, 2)]
+    for render in (here, there):
+        render.unload()
+    against = np.sign(votes)
+    counts = np.maximum(np.count_nonzero(against, axis=1), 1)
+    return bool((against.sum(axis=1) > SURE * np.sqrt(counts)).any())
+
+
+def _is_inside(place: tuple[Array, Array], window: Window) -> Mask:
+    x, y = place
+    return np.asarray((x >= window.x0) & (x <= window.x1 - 1) & (y >= window.y0) & (y <= window.y1 - 1))
+
+
+def _means_at(image: Array, x: Array, y: Array) -> Array:
+    """Return the means (n, c) of the 3 x 3 pixels around positions (n); NaN and infinities count as 0."""
+    height, width = image.shape[:2]
+    total = np.zeros((len(x), image.shape[-1]), np.float32)
+    for row, column in itertools.product((-1, 0, 1), repeat=2):
+        nearest = nearest_indices(np.clip(x + column, 0, width - 1), np.clip(y + row, 0, height - 1), (height, width))
+        total += np.nan_to_num(image.reshape(-1, image.shape[-1]).take(nearest, axis=0), posinf=0, neginf=0)
+    return total / np.float32(9)
 
 
 def _at_places(

@@ -12,24 +12,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.fusion.neighbours.bands import for_bands, rows_in_bands, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
 from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS, Features, RenderBand, RenderPair, read
 from oiio_msspl.fusion.neighbours.results import Images, ResultBand, images_of
-from oiio_msspl.fusion.neighbours.trust import Judge, Light
-from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.neighbours.trust import Judge, Light, RenderLight, ResultLight
 from oiio_msspl.image.arrays import Array, blank, unload
-from oiio_msspl.image.colour import luminance
 
 #: Bytes for each pixel of the rows that are averaged at a time: of renders without their features, and of results.
-BYTES_OF_RENDERS, BYTES_OF_RESULTS = 44, 96
+BYTES_OF_RENDERS, BYTES_OF_RESULTS = 56, 96
 
 F = TypeVar("F", RenderPair, FusedFrame)
 C = TypeVar("C", RenderPair, FusedFrame, contravariant=True)
@@ -69,8 +69,7 @@ def average_renders(
     """
     alignment = pair.alignment
     window = alignment.hr_data_window
-    lrhs, hrls = pair.luminances
-    light = Light(alignment, lrhs, hrls, lrhs)
+    light = RenderLight(alignment, *pair.colours)
     low: Features = {}
     if not pair.is_one_render:
         low = {name: values.copy() for name, values in read(pair.lr, alignment.lr_data_window, features).items()}
@@ -80,7 +79,8 @@ def average_renders(
     def band(core: Window, area: Window) -> RenderBand:
         return RenderBand(pair, light, low, high, core, area)
 
-    frames = _average(alignment, light, before, after, band, _weight(sum(image.shape[-1] for image in high.values())))
+    weight = _weight(sum(image.shape[-1] for image in high.values()))
+    frames = _average(light, before, after, band, lambda neighbour: neighbour.colours, weight)
     hr = _replaced(pair.hr, high, window)
     return hr if pair.is_one_render else _replaced(pair.lr, low, alignment.lr_data_window), hr, frames
 
@@ -99,44 +99,75 @@ def average_results(
     """
     alignment = frame.alignment
     window = alignment.hr_data_window
-    picture = for_bands(alignment, lambda core, _: to_grid(alignment, luminance(images_of(frame, core)[RGB]), core))
-    light = Light(alignment, frame.lrhs_luminance, frame.hrls_luminance, np.concatenate(picture))
+    light = ResultLight(alignment, frame.lrhs_luminance, frame.hrls_luminance, _picture(frame))
     images: Images = {name: blank(image.shape, on_disk=False) for name, image in images_of(frame, window).items()}
 
     def band(core: Window, area: Window) -> ResultBand:
         return ResultBand(frame, light, images, core, area)
 
-    frames = _average(alignment, light, before, after, band)
+    frames = _average(light, before, after, band, lambda neighbour: [_picture(neighbour)])
     if frame.frames is not None:
         # Averages of averages. If all weights are equal, this is the exact number within 7 percent.
         frames = np.sqrt(np.square(frames) + np.square(frame.frames) - 1)
     return replace(frame, rgb=images[RGB], alpha=images.get("alpha"), frames=frames)
 
 
+def _picture(frame: FusedFrame) -> Array:
+    """Return the colours of a fused frame (h, w, 3) over the grid."""
+    bands = for_bands(frame.alignment, lambda core, _: to_grid(frame.alignment, images_of(frame, core)[RGB], core))
+    return np.concatenate(bands)
+
+
 def _average(
-    alignment: Alignment,
     light: Light,
     before: Sequence[Hop[F]],
     after: Sequence[Hop[F]],
     band_of: Callable[[Window, Window], Band[F]],
+    colours_of: Callable[[F], Sequence[Array]],
     weight: float = 1.0,
 ) -> Array:
     """Average a frame with its neighbours, band by band, and return the number of frames (h, w, 1)."""
-    window = alignment.hr_data_window
+    window = light.alignment.hr_data_window
     frames: Array = blank((window.height, window.width, 1))
+    sides = [(hops, _coarse_trust(light, hops, colours_of)) for hops in (before, after)]
 
     def work(core: Window, area: Window) -> None:
         band = band_of(core, area)
-        for hops in (before, after):
-            path, judge = Path(area, window), light.judge(area)
+        for hops, coarse in sides:
+            path, judge = Path(area, window), light.judge(area, coarse)
             for hop in hops:
                 path.follow(hop.there, hop.back, hop.frame.alignment.hr_data_window)
                 band.add(hop, path, judge)
         frames[core.slices(window)] = band.finish()
         unload(frames)
 
-    for_bands(alignment, work, weight)
+    for_bands(light.alignment, work, weight)
     return frames
+
+
+def _coarse_trust(light: Light, hops: Sequence[Hop[F]], colours_of: Callable[[F], Sequence[Array]]) -> list[Array]:
+    """Return how much each neighbour on one side counts by the light of large areas, see :meth:`Light.coarse_trust`."""
+    alignment, cell = light.alignment, np.float32(light.cell)
+    grid, window = alignment.grid, alignment.hr_data_window
+    path, result = Path(window, window, light.cell), []
+    for hop in hops:
+        path.follow(hop.there, hop.back, hop.frame.alignment.hr_data_window)
+        rows, other = slice(0, len(path.valid)), hop.frame.alignment.grid
+        (from_x, from_y), (to_x, to_y) = path.starts(rows), path.positions(rows)
+        # Cells count from the corner of each frame's grid.
+        moved_x = (to_x - from_x + np.float32((grid.x0 - other.x0) * alignment.scale)) / cell
+        moved_y = (to_y - from_y + np.float32((grid.y0 - other.y0) * alignment.scale)) / cell
+        y, x = np.mgrid[: light.shape[0], : light.shape[1]].astype(np.float32)
+        x, y = x + _of_shape(moved_x, light.shape), y + _of_shape(moved_y, light.shape)
+        colours = [sample_linear(light.cells(image), x, y) for image in colours_of(hop.frame)]
+        result.append(light.coarse_trust(colours, _of_shape(path.valid, light.shape)))
+    return result
+
+
+def _of_shape(plane: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Repeat the last row and column of a plane, or leave them out, so that it has a shape (h, w)."""
+    margins = [(0, max(0, side - own)) for side, own in zip(shape, plane.shape, strict=True)]
+    return np.pad(plane, margins, mode="edge")[: shape[0], : shape[1]]
 
 
 def memory_to_average_renders(window: Window, channels: int) -> int:

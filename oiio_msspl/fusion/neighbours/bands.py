@@ -19,10 +19,10 @@ T = TypeVar("T")
 #: Two bands are worked on at a time. Together they have at most this many pixels, unless a band would have fewer rows
 #: than ``BAND_ROWS``: the rows around a band are computed twice.
 BAND_PIXELS, BAND_ROWS = 1 << 22, 128
-#: The rows of a band are a multiple of every scale.
+#: The rows of a band, and those around it, are a multiple of every scale.
 ROW_MULTIPLE = max(SCALES)
-#: Rows and columns around a pixel that decide on it, without those that interpolation needs.
-REACH = 28
+#: Rows and columns around a pixel that decide on it.
+REACH = 48
 
 
 def for_bands(alignment: Alignment, work: Callable[[Window, Window], T], weight: float = 1.0) -> list[T]:
@@ -34,11 +34,11 @@ def for_bands(alignment: Alignment, work: Callable[[Window, Window], T], weight:
         weight: how many times the usual memory a pixel takes. Bands have fewer rows then.
     """
     window, scale = alignment.hr_data_window, alignment.scale
-    halo, rows = -(-REACH // scale) * scale + 2 * scale, _band_rows(window, weight)
+    rows = _band_rows(window, weight)
     bands = []
     for top in range(alignment.grid.y0 * scale, alignment.grid.y1 * scale, rows):
         core = Window(window.x0, max(top, window.y0), window.x1, min(top + rows, window.y1))
-        area = Window(core.x0, max(top - halo, window.y0), core.x1, min(top + rows + halo, window.y1))
+        area = Window(core.x0, max(top - REACH, window.y0), core.x1, min(top + rows + REACH, window.y1))
         bands.append((core, area))
     return two_at_a_time(lambda band: work(*band), bands)
 

@@ -37,10 +37,11 @@ class Path:
     Args:
         area: the pixels that are followed.
         window: data window of their frame.
+        step: follow the middle of each square of ``step`` x ``step`` pixels alone.
     """
 
-    def __init__(self, area: Window, window: Window) -> None:
-        self._area, self._start, self._end = area, window, window
+    def __init__(self, area: Window, window: Window, step: int = 1) -> None:
+        self._area, self._start, self._end, self._step = area, window, window, step
         #: How many hops were followed.
         self.hops = 0
         #: Positions (h, w) in pixels; None for the pixel itself.
@@ -49,7 +50,7 @@ class Path:
         #: Flat indices (h, w) of the nearest pixels in the data window of the last frame; None with ``x``.
         self.nearest: NDArray[np.intp] | None = None
         #: Where the last frame shows the same surface (h, w).
-        self.valid: Mask = np.ones((area.height, area.width), bool)
+        self.valid: Mask = np.ones((-(-area.height // step), -(-area.width // step)), bool)
         #: Where an object has moved that is not followed (h, w); None if nothing has.
         self.moved_objects: Mask | None = None
 
@@ -85,9 +86,11 @@ class Path:
                 good &= np.square(miss.real) + np.square(miss.imag) < there.tolerance**2  # false for NaN, too
 
         for_row_blocks(work, *shape)
-        if there.moved_objects is not None:
-            moved = self._values(there.moved_objects, slice(0, shape[0]), self.nearest)
-            self.moved_objects = moved if self.moved_objects is None else self.moved_objects | moved
+        ends = self.nearest if places is None else places[2]
+        for objects, indices in ((there.moved_objects, self.nearest), (back.moved_objects, ends)):
+            if objects is not None:
+                moved = self._values(objects, slice(0, shape[0]), indices)
+                self.moved_objects = moved if self.moved_objects is None else self.moved_objects | moved
         if places is not None:
             self.x, self.y, self.nearest = places
         self.valid, self._end = valid, window
@@ -97,16 +100,30 @@ class Path:
         """Return values over a data window at flat indices; at these rows of the area if there are none."""
         if indices is not None:
             return values.reshape(-1).take(indices, mode="clip")  # a check of all indices takes as long as to take them
-        return np.asarray(values[self._rows(rows).slices(self._start)])
+        return np.asarray(self._thinned(values[self._rows(rows).slices(self._start)]))
 
     def positions(self, rows: slice) -> tuple[Array, Array]:
         """Return the positions of some rows, x and y, (n, w) each."""
         if self.x is not None and self.y is not None:
             return self.x[rows], self.y[rows]
-        return pixel_positions(self._rows(rows))
+        return self.starts(rows)
+
+    def starts(self, rows: slice) -> tuple[Array, Array]:
+        """Return x and y of the pixels where some rows start, (n, w) each; they are not to be changed."""
+        x, y = pixel_positions(self._rows(rows))
+        return self._thinned(x), self._thinned(y)
 
     def _rows(self, rows: slice) -> Window:
-        return replace(self._area, y0=self._area.y0 + rows.start, y1=self._area.y0 + rows.stop)
+        top, step = self._area.y0, self._step
+        return replace(self._area, y0=top + rows.start * step, y1=min(top + rows.stop * step, self._area.y1))
+
+    def _thinned(self, plane: NDArray[Any]) -> NDArray[Any]:
+        """Return the pixels of a plane that are followed."""
+        if self._step == 1:
+            return plane
+        middle = self._step // 2
+        y, x = (np.minimum(np.arange(middle, side + middle, self._step), side - 1) for side in plane.shape[:2])
+        return plane[y[:, None], x]
 
     def place_in(self, window: Window) -> Window:
         """Return the rows of a window around the positions that cubic interpolation reads."""

@@ -5,7 +5,8 @@ To average renders is as if the frame had more samples. The network then sees le
 average of fused frames no longer has.
 
 - The HRLS's pixels are fetched from the nearest pixel of the neighbour. Interpolation would spread their noise, which
-  networks take for texture.
+  networks take for texture. In clean renders the wrong place would show, so their light is multiplied by the ratio of
+  the albedo here and there, and their albedo and normals are those of the frame.
 - The LRHS has less noise, and its pixels are large. Its light and alpha are interpolated. Other layers, such as the
   albedo, have hardly any noise to remove. They are fetched from the nearest pixel, which takes less time.
 """
@@ -19,18 +20,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
+from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
 from oiio_msspl.exr.render import ReadableRender, Render, Window
-from oiio_msspl.fusion.checks.averages import bounded_luminance
+from oiio_msspl.fusion.checks.averages import BRIGHTEST
 from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
 from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import RepairCounts, read_lrhs
-from oiio_msspl.image.arrays import Array, Mask, blank, repair, unload
+from oiio_msspl.image.arrays import Array, Mask, repair, unload
+from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import even_and_odd, grown, interpolate, means_around
-from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices, sample_cubic
 from oiio_msspl.model.contract import ONE_SIZE
 
@@ -45,6 +46,11 @@ OTHER_BRIGHTNESS = 4 / 5**0.5
 #: There, a neighbour counts less by this, too. It lacks some pixels, so the noise changes from pixel to pixel, and the
 #: network takes single noisy pixels for detail.
 BESIDE_HIDDEN = np.float32(0.7)
+#: Renders are clean if the variance of the noise of an HRLS pixel is less than this, relative to the light: 8 spp.
+CLEAN = 0.125
+#: A neighbour's nearest pixel lies up to half a pixel beside the surface, where the albedo may differ. In clean renders
+#: that shows, so light is corrected by the ratio of the albedos up to this factor. ``DARK_ALBEDO`` is added to both.
+ANOTHER_ALBEDO, DARK_ALBEDO = np.float32(1.25), 0.01
 #: The usual number of channels of a pair.
 USUAL_CHANNELS = 10
 
@@ -69,46 +75,27 @@ class RenderPair:
         return align(self.lr, self.hr)
 
     @cached_property
-    def luminances(self) -> tuple[Array, Array]:
-        """Luminance of the LRHS, and of the HRLS averaged over its pixels, (h, w) each over the alignment's grid.
+    def colours(self) -> tuple[Array, Array]:
+        """Colours of the LRHS, and of the HRLS averaged over its pixels, (h, w, 3) each over the alignment's grid.
 
         Both show the same places: where an odd size was rounded, the LRHS is interpolated. Of one render, both are
-        that of its even and of its odd pixels.
+        those of its even and of its odd pixels. All are finite and >= 0.
         """
         alignment = self.alignment
+
+        def band(core: Window, _: Window) -> Array:
+            return to_grid(alignment, _bounded(repair(read(self.hr, core, [RGB])[RGB])[0]), core)
+
+        high = np.concatenate(for_bands(alignment, band))
         if self.is_one_render:
-            return even_and_odd(np.concatenate(for_bands(alignment, lambda core, _: self.read_hr_luminance(core))))
+            return even_and_odd(high)
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
-        high = for_bands(alignment, lambda core, _: to_grid(alignment, self.read_hr_luminance(core), core))
-        return bounded_luminance(lrhs), np.concatenate(high)
-
-    @cached_property
-    def hr_luminance(self) -> Array | None:
-        """Luminance (h, w) of the HRLS over its data window, finite and >= 0; None if its pixels are not in memory."""
-        if not isinstance(self.hr, Render):
-            return None
-        rgb = np.asarray(self.hr.layers[RGB])
-        result: Array = blank(rgb.shape[:2])
-
-        def work(rows: slice) -> None:
-            result[rows] = _luminance(rgb[rows])
-
-        for_row_blocks(work, len(rgb), rgb[0].size)
-        unload(result)
-        return result
-
-    def read_hr_luminance(self, window: Window) -> Array:
-        """Read the luminance (h, w) of the HRLS over a window that counts from the top left of the display window."""
-        if self.hr_luminance is None:
-            return _luminance(read(self.hr, window, [RGB])[RGB])
-        return np.asarray(self.hr_luminance[window.slices(self.alignment.hr_data_window)])
+        return _bounded(lrhs), high
 
     def unload(self) -> None:
         """Give the memory of pixels that wait in temporary files back to the system."""
         self.lr.unload()
         self.hr.unload()
-        if self.hr_luminance is not None:
-            unload(self.hr_luminance)
 
 
 def shared_noise(frame: RenderPair, neighbour: RenderPair) -> float:
@@ -121,10 +108,9 @@ def shared_noise(frame: RenderPair, neighbour: RenderPair) -> float:
     Raises:
         InputError: pixels can't be decoded.
     """
-    luminances = frame.luminances, neighbour.luminances
     if frame.alignment.grid != neighbour.alignment.grid:
         return 0.0
-    first, second = (np.sign(low - high) for low, high in luminances)
+    first, second = (np.sign(np.subtract(*map(luminance, pair.colours))) for pair in (frame, neighbour))
     alike = first * second
     count = np.count_nonzero(alike)
     return float(alike.sum(dtype=np.float64) / count) if count else 0.0
@@ -158,18 +144,24 @@ class RenderBand:
         self._pair, self._light, self._area = pair, light, area
         self._names, self._low_names = list(high), list(low)
         self._alignment = alignment = pair.alignment
-        self._luminance = pair.read_hr_luminance(area)
         self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
         self._high_images = {name: image[core.slices(alignment.hr_data_window)] for name, image in high.items()}
         for name, values in read(pair.hr, core, self._names).items():
             self._high_images[name][:] = values
-        self._high = WeightedSum(self._high_images)
+        # Half of the noise of the mean of both renders is that of the HRLS. Clean albedo and normals need no average.
+        clean = 2 * light.noise * alignment.scale**2 < CLEAN
+        own = (ALBEDO, NORMAL) if clean else ()
+        self._albedo = repair(self._high_images[ALBEDO])[0] if clean and ALBEDO in self._names else None
+        self._high = WeightedSum({name: image for name, image in self._high_images.items() if name not in own})
         #: The grid pixels of the area, and those of ``core`` that the LRHS has: it may lack a row or a column.
         self._grid = grid_window(alignment, area)
-        self._low_luminance = pair.luminances[0][self._grid.slices(alignment.grid)]
+        self._colours = [colours[self._grid.slices(alignment.grid)] for colours in pair.colours]
+        #: What a neighbour's HRLS that is hidden is taken for: of one render, both colours are a part of it.
+        self._mean_colours = sum(self._colours) / np.float32(2) if pair.is_one_render else self._colours[1]
         self._low_place = grid_window(alignment, core).intersect(alignment.lr_data_window)
         inside = self._low_place.slices(alignment.lr_data_window)
-        self._low = WeightedSum({name: image[inside] for name, image in low.items()}) if low else None
+        shown = {name: image[inside] for name, image in low.items() if name not in own}
+        self._low = WeightedSum(shown) if shown else None
 
     def add(self, hop: Hop[RenderPair], path: Path, judge: Judge) -> None:
         """Add the renders of a neighbour that a path leads to."""
@@ -177,21 +169,32 @@ class RenderBand:
         high = _Nearest(neighbour, path, self._names)
         valid = high.finite() & path.valid
         share = to_grid(alignment, valid.astype(np.float32), area)
-        hrls = to_grid(alignment, np.where(valid, high.luminance(), self._luminance), area)
+        colours = high.pixels(RGB, 0, len(valid))
+        hrls = to_grid(alignment, _bounded(colours) * valid[..., None], area)
+        hrls = np.where(share[..., None] >= COVERED, hrls / np.maximum(share, 1e-6)[..., None], self._mean_colours)
         if self._low is None:
             lrhs, hrls = even_and_odd(hrls)
         else:
             low, usable = self._fetch_low(neighbour, path, valid, share)
             usable &= _make_finite(low)
-            lrhs = self._in_grid(_luminance(low[RGB]), usable, neighbour.alignment.stretch)
+            lrhs = self._in_grid(_bounded(low[RGB]), usable, neighbour.alignment.stretch)
         counted = judge(lrhs, hrls)
         if path.moved_objects is not None:
             counted = counted * self._far_from(path.moved_objects)
-        bright = likeness(self._low_luminance, lrhs, self._light.darkest, OTHER_BRIGHTNESS, steep=True)
+        own, other = (luminance(colours) for colours in (self._colours[0], lrhs))
+        bright = likeness(own, other, self._light.darkest, OTHER_BRIGHTNESS, steep=True)
         counted = counted * np.where(grown(share < 1, 2), BESIDE_HIDDEN * bright, np.float32(1))
         weight = from_grid(alignment, counted, area) * valid
         top = self._rows.start
-        self._high.add(lambda name, rows: high.pixels(name, top + rows.start, top + rows.stop), weight[self._rows])
+
+        def pixels(name: str, rows: slice) -> Array:
+            start, stop = top + rows.start, top + rows.stop
+            values = colours[start:stop] if name == RGB else high.pixels(name, start, stop)
+            if name != RGB or self._albedo is None or path.nearest is None:
+                return values
+            return values * _ratio(self._albedo[rows], high.pixels(ALBEDO, start, stop))
+
+        self._high.add(pixels, weight[self._rows])
         if self._low is not None:
             place = self._low_place.slices(self._grid)
             self._low.add(lambda name, rows: low[name][place][rows], (counted * usable)[place])
@@ -208,7 +211,7 @@ class RenderBand:
         return frames
 
     def _in_grid(self, lrhs: Array, usable: Mask, stretch: tuple[float, float]) -> Array:
-        """Bring the luminance (h, w) of an LRHS to the grid pixels; where it is not usable, take the frame's own."""
+        """Bring the colours (h, w, 3) of an LRHS to the grid pixels; where it is not usable, take the frame's own."""
         if stretch != (1.0, 1.0):
             grid = self._grid
             columns, rows = (
@@ -219,7 +222,7 @@ class RenderBand:
                 interpolate(interpolate(plane, rows, 0), columns, 1) for plane in (lrhs, usable.astype(np.float32))
             )
             usable = share > 0.999  # a sum of shares may be rounded
-        return np.where(usable, lrhs, self._low_luminance)
+        return np.where(usable[..., None], lrhs, self._colours[0])
 
     def _far_from(self, moved_objects: Mask) -> Array:
         """Return how much a neighbour counts around objects that are not followed: 0 to 1, (h, w) over the grid."""
@@ -274,18 +277,12 @@ class _Nearest:
         #: Flat indices in the data window; these pixels begin at ``_first``.
         self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
         self._finite = _finite_pixels(pixels)
-        whole = neighbour.hr_luminance
-        self._luminance = np.ravel(_luminance(pixels[RGB]) if whole is None else whole[place.slices(window)])
 
     def finite(self) -> Mask:
         """Return where all features are finite, (h, w)."""
         if self._finite is None:
             return np.ones(self._size, bool)
         return self._finite.take(self._indices(0, self._size[0]))
-
-    def luminance(self) -> Array:
-        """Return the luminance (h, w) of the beauty, finite and >= 0."""
-        return self._luminance.take(self._indices(0, self._size[0]), mode="wrap")
 
     def pixels(self, name: str, start: int, stop: int) -> Array:
         """Return a feature at some rows (n, w, c). Pixels that are not finite are 0."""
@@ -301,6 +298,12 @@ class _Nearest:
             return self._nearest[start:stop] - self._first
         width = self._size[1]
         return np.arange(start * width, stop * width, dtype=np.intp).reshape(-1, width)
+
+
+def _ratio(own: Array, other: Array) -> Array:
+    """Return what brings light of a surface of albedo ``other`` to the albedo ``own`` beside it, (h, w, 3)."""
+    dark = np.float32(DARK_ALBEDO)
+    return np.clip((own + dark) / (np.maximum(other, 0) + dark), 1 / ANOTHER_ALBEDO, ANOTHER_ALBEDO)
 
 
 def _take(planes: Sequence[Array], indices: NDArray[np.intp]) -> Array:
@@ -339,9 +342,9 @@ def _finite_pixels(features: Mapping[str, Array]) -> Mask | None:
     return np.logical_and.reduce([np.isfinite(values).all(axis=-1) for values in doubtful]) if doubtful else None
 
 
-def _luminance(rgb: Array) -> Array:
-    """Return the luminance (h, w) of a beauty (h, w, 3), finite and >= 0."""
-    return bounded_luminance(repair(rgb)[0])
+def _bounded(rgb: Array) -> Array:
+    """Return finite colours (h, w, 3) without values that are negative, or so large that sums overflow."""
+    return np.clip(rgb, 0, BRIGHTEST)
 
 
 def read(render: ReadableRender, window: Window, features: Sequence[str] | None = None) -> Features:

@@ -54,14 +54,14 @@ class ResultBand:
         alignment, area = self._light.alignment, self._area
         if path.hops == 1:
             self._borders = _borders(hop.there, self._window, area)
-            if hop.there.moved_objects is not None:
-                self._borders |= grown(hop.there.moved_objects[area.slices(self._window)], 2)
+            if path.moved_objects is not None:
+                self._borders |= grown(path.moved_objects, 2)
         warped = _warp(hop.frame, path)
-        here, there = luminance(self._own[RGB]), luminance(warped[RGB])
-        low = to_grid(alignment, np.where(path.valid, there, here), area)
-        weight = from_grid(alignment, judge(low, low), area) * path.valid
+        picture = to_grid(alignment, np.where(path.valid[..., None], warped[RGB], self._own[RGB]), area)
+        weight = from_grid(alignment, judge(picture), area) * path.valid
         mixed = self._borders | _borders_at(hop, path)
-        weight[mixed] *= likeness(here[mixed], there[mixed], self._light.darkest, DIFFERENT_MIX)
+        here, there = (luminance(images[RGB][mixed]) for images in (self._own, warped))
+        weight[mixed] *= likeness(here, there, self._light.darkest, DIFFERENT_MIX)
         # A neighbour may have no alpha.
         inside = {name: warped.get(name, image)[self._rows] for name, image in self._own.items()}
         self._sum.add(lambda name, rows: inside[name][rows], weight[self._rows])

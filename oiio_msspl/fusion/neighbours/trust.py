@@ -1,30 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tells whether the light of a frame's neighbour has changed.
 
-Both renders of a frame, `L` and `H`, are compared with those of a neighbour at the LRHS's resolution. They have
-independent noise, so the mean of the product of the two differences is the squared change of the light without the
-noise of the renders. (Zheng et al. 2021 estimate errors from two independent buffers in the same way.)
+Both renders of a frame, `L` and `H`, are compared with those of a neighbour at the LRHS's resolution, in each colour.
+They have independent noise, so the mean of the product of the two differences is the squared change of the light
+without the noise of the renders. (Zheng et al. 2021 estimate errors from two independent buffers in the same way.) The
+noise of this mean is known from `L - H`. Where the mean is larger than chance allows, the light has changed.
+
+The larger the area, the smaller a change that is certain: 20 percent in a few pixels, 1 percent in a whole frame. So
+the differences are averaged to cells of half the resolution, again and again, and each resolution is judged. What is
+certain of a small square counts more than what the large ones around it say.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.neighbours.bands import REACH, grid_window
+from oiio_msspl.fusion.neighbours.bands import grid_window
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.image.arrays import Array
-from oiio_msspl.image.filters import grown, max_3x3, means_around, sum_3x3
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample, grown, max_3x3, means_around, sum_3x3, upsample_linear
 
-#: The change is averaged over squares of two sizes, in HRLS pixels to each side. The small one finds the edge of a
-#: shadow, the large one a faint change of all the light.
-RADII = (14, REACH)
+#: Side of the smallest cells that are judged, in HRLS pixels, unless LRHS pixels are larger; and side of the smallest
+#: that are judged over the whole frame, and not in bands of rows.
+CELL, COARSE = 4, 16
+#: Products are averaged over the cells up to these numbers of rows and columns away: the large square finds a faint
+#: change, the small one the edge of a change.
+REACHES = (3, 1)
+#: The noise is averaged over the pixels up to this number of rows and columns away.
+NOISE_REACH = 3
 #: The error of a fused frame is as large as the noise of the mean of this many HRLS pixels.
 PIXELS_AVERAGED = 80.0
-#: How many standard deviations of its own noise are subtracted from an estimated change.
-DOUBT = 0.5
+#: A change is certain from this many standard deviations of the mean of products on. From the second number on, a small
+#: square contradicts what the large ones around it say.
+CERTAIN, CONTRADICTED = 2.0, 4.0
+#: Before differences are averaged to larger cells, they are limited to this many standard deviations of one of them: a
+#: highlight that moves says nothing of the surface around it.
+MOST_SAID = np.float32(3.0)
 #: Differences relative to the local brightness are limited to this, because a firefly says nothing of the light.
 LARGEST_DIFFERENCE = 3.0
 #: The local brightness is at least this share of the frame's.
@@ -36,68 +53,215 @@ EQUAL = 1e-4
 LAMP = 3.0
 
 #: Says how much a neighbour counts by its light, as :meth:`Light.judge` does.
-Judge = Callable[[Array, Array], Array]
+Judge = Callable[..., Array]
 
 
-class Light:
-    """The light of a frame, as both of its renders show it.
+class Light(ABC):
+    """The light of a frame over the alignment's grid.
 
     Args:
         alignment: of the frame.
-        lrhs, hrls: luminance of both renders (h, w) over the grid.
-        picture: luminance (h, w) over the grid that differences are relative to.
+        lrhs, hrls: both renders (h, w, c) over the grid.
+        picture: colours (h, w, 3) over the grid that differences are relative to.
     """
 
     def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array, picture: Array) -> None:
         self.alignment = alignment
         #: Luminance that is added to the local brightness.
-        self.darkest = DARKEST * float(picture.mean(dtype=np.float64)) + 1e-30
-        self._brightness = means_around(picture, [1])[0] + np.float32(self.darkest)
-        self._renders = lrhs, hrls
-        self._least, self._most = _bounds(lrhs, hrls)
-        low, high = (render / self._brightness for render in self._renders)
-        noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))
-        reaches = [max(1, round(radius / alignment.scale)) for radius in RADII]
-        #: For each radius in LRHS pixels: the variance of the mean of both renders.
-        self._noise = dict(zip(reaches, means_around(noise, reaches), strict=True))
+        self.darkest = DARKEST * float(luminance(picture).mean(dtype=np.float64)) + 1e-30
+        #: How many times the grid is halved to get cells.
+        self._halvings = max(0, round(np.log2(CELL / alignment.scale)))
+        self.cell = alignment.scale << self._halvings
+        """Side of a cell, in HRLS pixels."""
+        self._steps = round(np.log2(COARSE / self.cell))
+        brightness = sum_3x3(picture) * np.float32(1 / 9) + np.float32(self.darkest)
+        self._brightness = self.cells(brightness)
+        bright = brightness if lrhs.shape[-1] == brightness.shape[-1] else luminance(brightness)[..., None]
+        self._noise = self.cells(_noise(lrhs, hrls, bright)) / np.float32(4**self._halvings)
+        self.noise = float(np.median(self._noise)) * 4**self._halvings
+        """Variance of the mean of both renders in an LRHS pixel, relative to the light: the median of all."""
+        self.shape = self._noise.shape
+        """Rows and columns of cells."""
+        self._share = self.cell**2 / PIXELS_AVERAGED
+        lights = (image[..., 0] if image.shape[-1] == 1 else luminance(image) for image in (lrhs, hrls))
+        self._least, self._most = _bounds(*lights)
 
-    def judge(self, area: Window) -> Judge:
+    def cells(self, image: Array) -> Array:
+        """Average an image over the grid (h, w, ...) to cells."""
+        for _ in range(self._halvings):
+            image = _halved(image)
+        return image
+
+    @abstractmethod
+    def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
+        """Return two differences to a neighbour's cells (h, w, 3), and the deviation of their product (h, w)."""
+
+    def judge(self, area: Window, coarse: Sequence[Array]) -> Judge:
         """Return the function that judges the neighbours on one side, from the nearest to the farthest.
 
-        It takes the luminance of a neighbour's LRHS and HRLS (h, w) over the grid pixels of ``area``; for a fused
-        neighbour, its luminance is both. It returns how much the neighbour counts (h, w), from 0 to 1, and never more
-        than a nearer one: a light that has changed there has changed in the farther one.
-        """
-        trust: Array | np.float32 = np.float32(1)
-        rows, _ = grid_window(self.alignment, area).slices(self.alignment.grid)
+        It takes the colours of a neighbour (h, w, 3) over the grid pixels of ``area``: of its LRHS and its HRLS, or of
+        its fused picture. It returns how much the neighbour counts (h, w), from 0 to 1, and never more than a nearer
+        one: a light that has changed there has changed in the farther one.
 
-        def judge(lrhs: Array, hrls: Array) -> Array:
-            nonlocal trust
-            trust = np.minimum(trust, self._trust(lrhs, hrls, rows))
-            return trust
+        Args:
+            area: rows of the frame, see :func:`oiio_msspl.fusion.neighbours.bands.for_bands`.
+            coarse: :meth:`coarse_trust` of each neighbour.
+        """
+        least: Array | np.float32 = np.float32(1)
+        rows, _ = grid_window(self.alignment, area).slices(self.alignment.grid)
+        maps = iter(coarse)
+
+        def judge(*neighbour: Array) -> Array:
+            nonlocal least
+            least = np.minimum(least, self._trust(neighbour, next(maps), rows))
+            return least
 
         return judge
 
-    def _trust(self, lrhs: Array, hrls: Array, rows: slice) -> Array:
-        """Return how much one neighbour counts, over some rows of the grid."""
-        brightness = self._brightness[rows]
-        product = np.ones_like(brightness)
-        for own, render in zip(self._renders, (lrhs, hrls), strict=True):
-            product *= np.clip((own[rows] - render) / brightness, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
-        trust = np.ones_like(product)
-        for (reach, variance), mean in zip(self._noise.items(), means_around(product, list(self._noise)), strict=True):
-            noise = variance[rows]
-            own_error = noise * np.float32(self.alignment.scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
-            uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
-            change = np.maximum(mean - uncertainty - own_error, 0)
-            np.minimum(trust, own_error / (own_error + change), out=trust)
-        least, most = _bounds(lrhs, hrls)
+    def _trust(self, neighbour: Sequence[Array], coarse: Array, rows: slice) -> Array:
+        """Return how much one neighbour counts (h, w), over some rows of the grid."""
+        height, width = neighbour[0].shape[:2]
+        parts = slice(rows.start >> self._halvings, -(-rows.stop >> self._halvings))
+        low, high, deviation = self._differences([self.cells(image) for image in neighbour], parts)
+        first = rows.start * self.alignment.scale // (COARSE // 2)
+        trust = _Cells(low, high, deviation, self._noise[parts], self._share).trust(self._steps - 1, coarse[first:])
+        if self._halvings:
+            trust = upsample_linear(trust, 1 << self._halvings, slice(0, len(trust)))[:height, :width]
+        lights = [luminance(image) for image in neighbour]
+        least, most = _bounds(lights[0], lights[-1])
         lamps = self._least[rows] > np.float32(LAMP) * (most + np.float32(self.darkest))
         lamps |= least > np.float32(LAMP) * (self._most[rows] + np.float32(self.darkest))
         if lamps.any():
             # Weights are interpolated between LRHS pixels, so those beside a lamp are 0, too.
             trust[grown(lamps)] = 0
         return trust
+
+    def coarse_trust(self, neighbour: Sequence[Array], valid: Mask) -> Array:
+        """Return how much a neighbour counts, 0 to 1, judged by cells of ``COARSE`` pixels and by larger ones.
+
+        Args:
+            neighbour: its colours (h, w, 3) at the places of the cells of the whole frame.
+            valid: where it shows the same surface (h, w).
+
+        Returns:
+            (h, w) over cells of half of ``COARSE`` pixels.
+        """
+        low, high, deviation = self._differences(neighbour, slice(None))
+        cells = _Cells(low * valid[..., None], high * valid[..., None], deviation, self._noise, self._share)
+        for _ in range(self._steps):
+            cells = cells.halved()
+        return _doubled(cells.trust())
+
+
+class RenderLight(Light):
+    """The light of a frame whose renders are averaged.
+
+    Args:
+        alignment: of the frame.
+        lrhs, hrls: colours of both renders (h, w, 3) over the grid.
+    """
+
+    def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array) -> None:
+        super().__init__(alignment, lrhs, hrls, lrhs)
+        self._renders = self.cells(lrhs), self.cells(hrls)
+
+    def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
+        brightness = self._brightness[rows]
+        low, high = (
+            _limited((own[rows] - other) / brightness) for own, other in zip(self._renders, neighbour, strict=True)
+        )
+        others: Array = _noise(neighbour[0], neighbour[1], brightness)
+        return low, high, 2 * (self._noise[rows] + others)
+
+
+class ResultLight(Light):
+    """The light of a frame whose fused picture `F` is averaged.
+
+    A fused neighbour `W` is compared with it, because both lack the same detail. The frame's renders are the referees:
+    (W - L) (W - H) - (F - L) (F - H) is by how much the squared error of `W` exceeds that of `F`.
+
+    Args:
+        alignment: of the frame.
+        lrhs, hrls: luminance of both renders (h, w) over the grid.
+        picture: colours of the fused frame (h, w, 3) over the grid.
+    """
+
+    def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array, picture: Array) -> None:
+        super().__init__(alignment, lrhs[..., None], hrls[..., None], picture)
+        self._picture = self.cells(picture)
+        doubt = self.cells(2 * luminance(picture) - lrhs - hrls) / luminance(self._brightness)
+        #: 2 F - L - H, relative to the brightness.
+        self._doubt = _limited(doubt)[..., None]
+
+    def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
+        low = _limited((neighbour[0] - self._picture[rows]) / self._brightness[rows])
+        return low, low + self._doubt[rows], np.float32(2 * np.sqrt(2 * min(self._share, 1))) * self._noise[rows]
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """What cells say of a neighbour."""
+
+    low: Array
+    high: Array
+    """Two differences to the neighbour (h, w, 3) whose noise is independent."""
+    deviation: Array
+    """Standard deviation (h, w) of their product."""
+    noise: Array
+    """Variance (h, w) of the mean of the frame's two renders."""
+    share: float
+    """Cells over which a fused frame averages this noise: 1 / their number."""
+
+    def halved(self) -> _Cells:
+        """Return cells of twice the size."""
+        most, quarter = MOST_SAID * np.sqrt(self.deviation)[..., None], np.float32(1 / 4)
+        low, high = (_halved(np.clip(difference, -most, most)) for difference in (self.low, self.high))
+        deviation, noise = (_halved(plane) * quarter for plane in (self.deviation, self.noise))
+        return _Cells(low, high, deviation, noise, self.share * 4)
+
+    def trust(self, steps: int = 99, coarse: Array | None = None) -> Array:
+        """Return how much the neighbour counts (h, w), judged by these cells and by larger ones.
+
+        Args:
+            steps: how often cells are halved.
+            coarse: what even larger cells say, (h, w) or more rows.
+        """
+        if steps and min(self.noise.shape) > 1:
+            coarse = _doubled(self.halved().trust(steps - 1, coarse))
+        height, width = self.noise.shape
+        trust = np.ones_like(self.noise) if coarse is None else coarse[:height, :width]
+        own_error = self.noise * np.float32(min(self.share, 1)) + np.float32(EQUAL)
+        means = means_around((self.low * self.high).mean(axis=-1), REACHES)
+        for reach, mean in zip(REACHES, means, strict=True):
+            one = self.deviation / np.float32(2 * reach + 1)
+            # Squared, because all neighbours may show the same other light.
+            least, most = (
+                np.square(own_error / np.maximum(change, own_error))
+                for change in (mean + np.float32(CONTRADICTED) * one, mean - np.float32(CERTAIN) * one)
+            )
+            trust = np.clip(trust, least, most)
+        return trust
+
+
+def _doubled(plane: Array) -> Array:
+    return upsample_linear(plane, 2, slice(0, len(plane)))
+
+
+def _halved(image: Array) -> Array:
+    """Return the means of 2 x 2 cells (h/2, w/2, ...), rounded up."""
+    margins = [(0, side % 2) if axis < 2 else (0, 0) for axis, side in enumerate(image.shape)]
+    return box_downsample(np.pad(image, margins, mode="edge") if margins[0][1] or margins[1][1] else image, 2)
+
+
+def _noise(lrhs: Array, hrls: Array, brightness: Array) -> Array:
+    """Return the variance (h, w) of the mean of both renders (h, w, c), relative to the brightness."""
+    squares = np.square(_limited((lrhs - hrls) / (2 * brightness))).mean(axis=-1)
+    (mean,) = means_around(squares, [NOISE_REACH])
+    return mean
+
+
+def _limited(differences: Array) -> Array:
+    return np.clip(differences, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
 
 
 def _bounds(lrhs: Array, hrls: Array) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.colour import luminance
 from oiio_msspl.jobs.checks import model_of_shot
 from oiio_msspl.jobs.frame import ShotFrame
 from oiio_msspl.jobs.inputs import InputOptions
@@ -85,7 +86,7 @@ class _RunOfPeer(ShotRun):
     def fuse(self, frame: ShotFrame) -> FusedFrame:
         """Denoise the averaged full-resolution render."""
         rgb = self._denoised(frame.averaged.hr)
-        lrhs, hrls = frame.averaged.luminances
+        lrhs, hrls = (luminance(colours) for colours in frame.averaged.colours)
         alignment = frame.averaged.alignment
         return FusedFrame(rgb, None, None, alignment, 1.0, repaired={}, lrhs_luminance=lrhs, hrls_luminance=hrls)
 

@@ -19,8 +19,8 @@ class Source:
 
     fields = ()
 
-    def __init__(self, kind=VECTORS, vector=(2.0, 0.0), objects=None, zeros_are_right=True):
-        self.kind, self.vector, self.objects, self.right = kind, vector, objects, zeros_are_right
+    def __init__(self, kind=VECTORS, vector=(2.0, 0.0), objects=None, zeros_are_right=True, wrong=False):
+        self.kind, self.vector, self.objects, self.right, self.wrong = kind, vector, objects, zeros_are_right, wrong
         self.reads = []
 
     def read(self, frame, neighbour, hop):
@@ -30,6 +30,9 @@ class Source:
 
     def moved_objects(self, frame, neighbour, vectors, known):
         return self.objects
+
+    def misleads(self, frame, neighbour, vectors, known):
+        return self.wrong
 
     def zeros_are_right(self, frame, neighbour):
         return self.right
@@ -75,3 +78,24 @@ def test_zeros_that_are_wrong_are_refused_each_time():
         with pytest.raises(InputError, match="between frames 1 and 2 are 0, though the picture moves"):
             motion.between(frame(2), frame(1))
     assert len(source.reads) == 2
+
+
+def test_vectors_that_mislead_are_refused():
+    with pytest.raises(InputError, match="between frames 1 and 2 do not lead to the same surfaces"):
+        ShotMotion(Source(wrong=True)).between(frame(1), frame(2))
+
+
+def test_objects_that_vectors_mislead_are_not_known_and_hidden_ones_are_not_objects():
+    objects = np.zeros(SIZE, bool)
+    objects[2, 3] = objects[4, 6] = True
+    source = Source(objects=objects)
+    # The vector of the other frame's pixel there leads elsewhere: something is in front.
+    source.read = lambda here, there, hop: (
+        np.where((np.mgrid[: SIZE[0], : SIZE[1]][1] == 5)[..., None] & (hop < 0), 0, np.float32((2 * hop, 0))),
+        np.ones(SIZE, bool),
+    )
+    there, back = ShotMotion(source).between(frame(1), frame(2))
+    misled = np.zeros(SIZE, bool)
+    misled[4, 6] = True
+    assert (there.moved_objects == misled).all() and (there.known == ~objects).all()
+    assert back.known is None and back.moved_objects is None

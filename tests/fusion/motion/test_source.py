@@ -17,6 +17,7 @@ from oiio_msspl.fusion.motion import source as motion
 from oiio_msspl.fusion.motion import vectors as motion_vectors
 from oiio_msspl.fusion.motion.flow import flow_vectors
 from oiio_msspl.fusion.motion.source import MotionFrame, MotionSource, find_motion
+from tests import moving_plane as plane
 from tests.conftest import rgb, write_exr
 from tests.moving_plane import (
     FOCAL,
@@ -163,14 +164,16 @@ def test_encoded_vectors_are_recognised_and_their_ends_are_not_believed(tmp_path
     np.testing.assert_allclose(found[known], vectors(truck_and_dolly, 1, 1)[known], atol=0.2)
 
 
-def test_premultiplied_vectors_are_divided_by_alpha(tmp_path):
+@pytest.mark.parametrize("name", ["motionvec", "velocity"])
+def test_premultiplied_vectors_are_divided_by_alpha(tmp_path, name):
+    """The table knows it of one layer. Of the other one, the pixels show it."""
     alpha = np.linspace(0, 1, WIDTH, dtype=np.float32) * np.ones((HEIGHT, 1), np.float32)
     form = MotionFormat(unit="screen", y="up")
     frames = [
         frame(
             tmp_path,
             t,
-            layer("motionvec", encode(vectors(truck_and_dolly, t, 1), form) * alpha[..., None]) | {"A": alpha},
+            layer(name, encode(vectors(truck_and_dolly, t, 1), form) * alpha[..., None]) | {"A": alpha},
         )
         for t in (0, 1)
     ]
@@ -599,7 +602,8 @@ def test_without_layers_that_tell_no_object_is_found(tmp_path, size):
     pair = [MotionFrame(map_render(open_exr(tmp_path / f"{name}.exr"))) for name in ("a", "b")]
     still, known = np.zeros((height, width, 2), np.float32), np.ones((height, width), bool)
     assert not MotionSource("static", "").moved_objects(*pair, still, known).any()
-    assert MotionSource("vectors", "").moved_objects(*pair, still, known) is None
+    assert not MotionSource("vectors", "").misleads(*pair, still + 2, known)
+    assert MotionSource("flow", "").moved_objects(*pair, still, known) is None
 
 
 def test_a_layer_of_an_unknown_name_is_told_by_the_pixels(tmp_path):
@@ -615,3 +619,10 @@ def test_a_layer_of_an_unknown_name_is_told_by_the_pixels(tmp_path):
     source = find_motion(frames[0], frames[1])
     assert "motion vectors (by the pixels wear.XY holds none); " in source.text
     assert source.text.startswith("no ")
+
+
+@pytest.mark.parametrize(("of_length", "misleads"), [(1, False), (0.8, False), (-1, True), (3, True)])
+def test_vectors_that_no_motion_or_the_opposite_beats_mislead(tmp_path, of_length, misleads):
+    pair = [MotionFrame(plane.frame(tmp_path, t, {}, guides=("albedo",))) for t in (0, 1)]
+    way, known = plane.vectors(plane.truck_and_dolly, 0, 1), np.ones((plane.HEIGHT, plane.WIDTH), bool)
+    assert MotionSource("vectors", "").misleads(*pair, of_length * way, known) == misleads

@@ -107,6 +107,53 @@ def test_light_that_changes_is_not_averaged(change):
     assert rms(made, truth, same) < 0.75 * rms(own, truth, same)
 
 
+@pytest.mark.parametrize("lights", [(1.5, 1.5, 1.5), (0.8, 0.8, 0.8), (1, 1, 1.5), (1.3, 0.92, 0.7)])
+@pytest.mark.parametrize("pixels", [0.0, 1.7])
+def test_a_frame_in_another_light_does_not_count(lights, pixels):
+    """A flash, a lamp that flickers in blue, or one that changes its hue at equal luminance."""
+    lit = texture(pixels) * np.float32(lights)
+    pairs = [pair_of(texture(), 1), pair_of(lit, 2), pair_of(lit * np.float32(1), 3)]
+    result = average_renders(pairs[0], [moved(pairs[1], pixels)], [moved(pairs[2], pixels)])
+    assert result.frames[:, 8:-8].mean() < 1.1
+    for render, own in ((result.hr, pairs[0].hr), (result.lr, pairs[0].lr)):
+        light = [layers["rgb"].mean(axis=(0, 1)) for layers in (render.layers, own.layers)]
+        assert np.allclose(*light, rtol=0.01)
+
+
+@pytest.mark.parametrize("pixels", [0.0, 3.0])
+def test_a_moving_picture_on_a_screen_does_not_count_and_the_wall_around_does(pixels):
+    """The screen stands still, or a wall with the screen is panned; its albedo shows nothing."""
+    film = np.random.default_rng(1).random((4, HEIGHT // 8, WIDTH // 8, 3)).repeat(8, 1).repeat(8, 2)
+    screen = np.s_[24:72, 56:112]
+    pairs = []
+    for number in range(3):
+        truth = texture(pixels * number)
+        shift = round(pixels * number)
+        truth[:, shift:][screen] = film[number][screen]
+        pairs.append(pair_of(truth, number))
+    result = average_renders(pairs[0], [moved(pairs[1], pixels), moved(pairs[2], pixels)], [])
+    assert result.frames[24:72, 56:112].mean() < 1.15
+    assert result.frames[:, 4:28].mean() > 1.4
+
+
+def test_clean_renders_keep_their_detail_where_a_surface_lies_between_pixels():
+    """Stripes of two pixels move by half of one. Only the albedo of the pixels that are fetched shows it."""
+    x = np.arange(WIDTH, dtype=np.float32)
+    pairs = []
+    for shift in (0.0, 0.4, 0.8):
+        stripes = (0.5 + 0.08 * np.sin((x - shift) * np.pi / 2.5))[None, :, None]
+        truth = np.broadcast_to(stripes, (HEIGHT, WIDTH, 3)).astype(np.float32)
+        noise = [np.random.default_rng(int(10 * shift)).normal(1, 0.02 / k, truth[::k, ::k].shape) for k in (1, SCALE)]
+        hr = Render.from_arrays("hr", rgb=(truth * noise[0]).astype(np.float32), albedo=truth.copy())
+        lr = Render.from_arrays("lr", rgb=(box_downsample(truth, SCALE) * noise[1]).astype(np.float32))
+        pairs.append((RenderPair(lr, hr), truth))
+    result = average_renders(pairs[0][0], [moved(pairs[1][0], 0.4), moved(pairs[2][0], 0.4)], [])
+    inside = np.s_[:, 8:-8]
+    own = pairs[0][0].hr.layers
+    assert rms(result.hr.layers["rgb"], pairs[0][1], inside) < rms(own["rgb"], pairs[0][1], inside)
+    assert np.array_equal(result.hr.layers["albedo"], own["albedo"])
+
+
 def test_a_small_lamp_in_the_neighbour_leaves_no_ghost():
     truth, lit = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32), np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
     lit[40:43, 61:65] = 200

@@ -243,3 +243,12 @@ def test_differences_of_any_brightness_are_relative():
     found = relative_difference(own, other, 1e-20)
     np.testing.assert_allclose(found[:4], [0, 1.5, 0, np.sqrt(0.5)], rtol=1e-5)
     assert found[4] > 1e18 and found[5] < -1e18
+
+
+@pytest.mark.parametrize("lights", [(1.5, 1.5, 1.5), (0.9, 0.9, 0.9), (1, 1, 1.5), (1.3, 0.92, 0.7)])
+def test_a_frame_in_another_light_does_not_count(lights):
+    frame = frame_of(texture(), 1)
+    others = [frame_of(texture() * np.float32(lights), seed) for seed in (2, 3)]
+    result = average_results(frame, [still(others[0])], [still(others[1])])
+    assert np.allclose(result.rgb.mean(axis=(0, 1)), frame.rgb.mean(axis=(0, 1)), rtol=0.01)
+    assert result.frames.mean() < 1.1

@@ -9,7 +9,7 @@ import typer
 
 from msspl_cli.commands import check, compare, fuse, inspect, models, nuke_install, render, submit
 from msspl_cli.errors import run
-from oiio_msspl import __version__
+from oiio_msspl._version import full_version
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -31,7 +31,7 @@ app = typer.Typer(no_args_is_help=True, **_SETTINGS)
 def _main(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
     """Inspect renders, list models and compare results. To fuse a pair, see [bold]msspl-fuse --help[/bold]."""
     if version:
-        print(__version__)
+        print(full_version())
         raise typer.Exit
 
 

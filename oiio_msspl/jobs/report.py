@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from oiio_msspl._version import __version__
+from oiio_msspl._version import full_version
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
 from oiio_msspl.aovs.views import name_of
@@ -18,10 +18,13 @@ from oiio_msspl.exr.layers import layer_by_channel, layers_of
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.digests import as_text
 from oiio_msspl.model.session import Session
 
 #: Samples of the LRHS below which a pair gets a warning, as a share of those of the HRLS, both per pixel of the frame.
 LEAST_SHARE = 1 / 8
+#: The attribute of a fused EXR that holds the digests of the weights, as :func:`.digests.as_text` writes them.
+WEIGHTS_ATTRIBUTE = "msspl/weights"
 
 
 @dataclass
@@ -32,6 +35,8 @@ class FrameReport:
     hr: MappedRender
     scale: int
     model: str
+    weights: dict[str, str]
+    """The digests of the model and of those that fuse passes, by name."""
     provider: str
     """The ONNX Runtime execution provider that ran the model."""
     convolutions: dict[str, int]
@@ -107,6 +112,7 @@ class FrameReport:
             "scale": self.scale,
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
+            "weights": self.weights,
             "provider": self.provider,
             "convolutions": self.convolutions,
             "aovs": self.aovs(),
@@ -120,7 +126,7 @@ class FrameReport:
             "warnings": self.warnings,
             "tiles": self.tiles,
             "seconds": {k: round(v, 3) for k, v in self.seconds.items()},
-            "version": __version__,
+            "version": full_version(),
         }
 
 
@@ -133,6 +139,7 @@ def report_on(
         hr=hr.for_model(session.contract.hrls),
         scale=fused.alignment.scale,
         model=session.name,
+        weights=session.weights,
         provider=session.provider,
         convolutions=session.convolutions,
         output=output,
@@ -229,8 +236,10 @@ def provenance(report: FrameReport) -> dict[str, str]:
     """
     views = {"msspl/views": ", ".join(name_of(view.hr.view) for view in report.fused_views())}
     return (views if report.other_views else {}) | {
-        "msspl/version": __version__,
+        "msspl/version": full_version(),
         "msspl/model": report.model,
+        WEIGHTS_ATTRIBUTE: as_text(report.weights),
+        "msspl/provider": report.provider,
         "msspl/scale": str(report.scale),
         "msspl/lrhs": report.lr.name,
         "msspl/hrls": report.hr.name,

@@ -11,15 +11,19 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from oiio_msspl._version import __version__
+from oiio_msspl._version import full_version
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, replacing
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
+from oiio_msspl.model.digests import as_text
 
 #: The keys that are read of ``first_fused`` in an earlier report. If a report of another version lacks some of them,
 #: frames are compared with the first one that this run fuses.
-FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "scale", "model", "aovs", "layers", "notes", "passes"}
+FIRST_FUSED = {
+    *("frame", "neighbours", "renderer", "view", "scale", "model", "weights", "version"),
+    *("aovs", "layers", "notes", "passes"),
+}
 
 #: The most layers that a warning names.
 MOST_NAMES = 6
@@ -105,7 +109,7 @@ class ShotReport:
             "temporal": self.temporal,
             "first_fused": self.first,
             "frames": entries,
-            "version": __version__,
+            "version": full_version(),
         }
 
     def save(self, path: Path) -> None:
@@ -152,7 +156,7 @@ def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
 
 
 def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """Compare the features, the scale, the model and the number of neighbours."""
+    """Compare the features, the scale, the model and its weights, the version and the number of neighbours."""
     words = {"default": "not found", "absent": "not found"}
     before, now = (
         {row["feature"]: words.get(row["status"], row["status"]) for row in report["aovs"] if row["status"] != "unused"}
@@ -162,6 +166,9 @@ def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
     pairs["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
     if here["scale"] == first["scale"]:  # each scale has models of its own
         pairs["the model"] = here["model"], first["model"]
+    if here["model"] == first["model"]:
+        pairs["the digest of its weights"] = as_text(here["weights"]), as_text(first["weights"])
+    pairs["the version"] = here["version"], first["version"]
     pairs["--temporal"] = str(here["neighbours"] or "off"), str(first["neighbours"] or "off")
     return [f"{what} is {state} here and {earlier}" for what, (state, earlier) in pairs.items() if state != earlier]
 

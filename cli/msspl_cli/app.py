@@ -40,7 +40,7 @@ app.command(epilog=check.EXAMPLES)(check.check)
 app.command(epilog=models.EXAMPLES)(models.models)
 app.command(epilog=compare.EXAMPLES)(compare.compare)
 app.command(epilog=fuse.EXAMPLES)(fuse.fuse)
-app.command(epilog=submit.EXAMPLES, options_metavar=submit.USAGE, context_settings=submit.SETTINGS)(submit.submit)
+app.command(epilog=submit.EXAMPLES)(submit.submit)
 app.command("nuke-install", epilog=nuke_install.EXAMPLES)(nuke_install.nuke_install)
 
 

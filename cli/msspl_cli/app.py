@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from msspl_cli.commands import check, compare, fuse, inspect, models, nuke_install, render, submit
+from msspl_cli.commands import blender_install, check, compare, fuse, inspect, models, nuke_install, render, submit
 from msspl_cli.errors import run
 from oiio_msspl._version import full_version
 
@@ -41,6 +41,7 @@ app.command(epilog=models.EXAMPLES)(models.models)
 app.command(epilog=compare.EXAMPLES)(compare.compare)
 app.command(epilog=fuse.EXAMPLES)(fuse.fuse)
 app.command(epilog=submit.EXAMPLES)(submit.submit)
+app.command("blender-install", epilog=blender_install.EXAMPLES)(blender_install.blender_install)
 app.command("nuke-install", epilog=nuke_install.EXAMPLES)(nuke_install.nuke_install)
 
 

@@ -10,8 +10,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LARGEST = 60e6
 
-pytestmark = pytest.mark.slow
-
 
 def build(kind, folder):
     """Build a package as pip does, and return its path."""

@@ -73,6 +73,7 @@ def test_the_exr_says_what_it_was_made_from(report_of, bilinear_models):
     for name, value in provenance(report).items():
         assert stored[name] == value
     assert stored["msspl/spp_average"] == "6"
+    assert stored["msspl/provider"] == "CPUExecutionProvider"
     model = bilinear_models[4]
     assert stored["msspl/weights"] == f"{model.stem} {digest(model)}"
     assert stored["msspl/version"] == report.as_dict()["version"] == full_version()

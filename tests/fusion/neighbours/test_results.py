@@ -243,3 +243,10 @@ def test_differences_of_any_brightness_are_relative():
     found = relative_difference(own, other, 1e-20)
     np.testing.assert_allclose(found[:4], [0, 1.5, 0, np.sqrt(0.5)], rtol=1e-5)
     assert found[4] > 1e18 and found[5] < -1e18
+
+
+def test_frames_that_were_averaged_before_count():
+    """The renders of three frames were averaged, and no fused neighbour is added."""
+    frame = frame_of(texture(), 1)
+    frame.frames = np.full((*frame.rgb.shape[:2], 1), 3, np.float32)
+    assert average_results(frame, [], []).frames == pytest.approx(3)

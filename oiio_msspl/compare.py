@@ -23,6 +23,7 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import HALF_MAX, Array, repair
 from oiio_msspl.image.colour import converted, same_space, space_of
 from oiio_msspl.image.metrics import RELMSE_GHARBI, SSIM_WINDOW, psnr, relmse, relmse_map, ssim
+from oiio_msspl.jobs.report import WEIGHTS_ATTRIBUTE
 from oiio_msspl.model.contract import SCALES
 
 #: The "Software" entry of error maps. It differs from that of previews, because fusing deletes old previews.
@@ -142,6 +143,16 @@ def note_on_views(comparison: Comparison) -> str:
     if is_in_all or not any(render.other_views for render in renders):
         return ""
     return f"Different views are compared: {', '.join(f'{name_of(r.view)} of {r.name}' for r in renders)}"
+
+
+def note_on_weights(comparison: Comparison) -> str:
+    """Say that different versions or weights fused these files; empty if the same did, or only one is fused."""
+    names = ("msspl/version", WEIGHTS_ATTRIBUTE)
+    makers = {r.name: [r.metadata[name] for name in names if name in r.metadata] for r in comparison.renders}
+    fused = {name: ", ".join(maker) for name, maker in makers.items() if maker}
+    if len(set(fused.values())) < 2:
+        return ""
+    return f"Different versions or weights made these: {'; '.join(f'{k} ({v})' for k, v in fused.items())}"
 
 
 def notes_on_broken(comparison: Comparison) -> list[str]:

@@ -14,6 +14,40 @@ from oiio_msspl.model.encoding import MAX_RADIANCE
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+#: OpenEXR 3.3 returns no headers without pixels.
+HEADER_ONLY = not OpenEXR.__version__.startswith("3.3.")
+
+
+#: Files and folders whose tests start programs, train, or run every model.
+SLOW = (
+    *("cli", "jobs/farm", "blender_addon/test_in_blender.py", "nuke_gizmo/test_msspl_nuke.py", "research/training"),
+    *("model/test_devices.py", "model/test_joint_models.py", "test_package.py", "test_pages.py"),
+    *("jobs/test_over_time.py", "jobs/test_over_time_views.py", "fusion/passes/test_fuse.py"),
+)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out slow tests if neither a path nor a marker is given: the quick ones take about five minutes."""
+    slow = tuple(Path(__file__).parent / name for name in SLOW)
+    for item in items:
+        if any(item.path.is_relative_to(path) for path in slow):
+            item.add_marker(pytest.mark.slow)
+    if not config.option.file_or_dir and not config.option.markexpr:
+        config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("slow")])
+        items[:] = [item for item in items if not item.get_closest_marker("slow")]
+
+
+def pytest_addoption(parser):
+    parser.addoption("--at-least", type=int, default=0, metavar="N", help="fail if fewer than N tests pass")
+
+
+def pytest_sessionfinish(session):
+    """Tests that were not collected, or skipped for want of a package, must not look like success."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    least = session.config.getoption("--at-least")
+    if reporter is not None and len(reporter.stats.get("passed", ())) < least:
+        reporter.write_line(f"fewer than {least} tests passed", red=True)
+        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
 
 
 def needs_shared(*parts: str):

@@ -10,6 +10,7 @@ from oiio_msspl.compare import (
     error_map,
     note_on_spaces,
     note_on_views,
+    note_on_weights,
     note_on_windows,
     notes_on_broken,
     open_comparison,
@@ -31,6 +32,20 @@ def test_scores_follow_the_conventions_that_they_are_named_after():
     measures = scores(image, truth)
     assert measures["relmse"] == relmse(image, truth, (0.5, 0.01))
     assert measures["relmse_gharbi"] == relmse(image, truth, RELMSE_GHARBI) != measures["relmse"]
+
+
+def test_files_that_different_weights_or_versions_fused_are_named(tmp_path):
+    def file(name, version, weights):
+        made_by = {"msspl/version": version, "msspl/weights": weights}
+        return write_exr(tmp_path / name, rgb(picture(16, 16)), **made_by)
+
+    a, b = file("a.exr", "1.0.0", "joint-x2 01"), file("b.exr", "1.0.0", "joint-x2 01")
+    c, d = file("c.exr", "1.0.0", "joint-x2 02"), file("d.exr", "1.0.1", "joint-x2 01")
+    render = write_exr(tmp_path / "render.exr", rgb(picture(16, 16)))
+    assert note_on_weights(open_comparison([a, b], render)) == ""
+    for other, maker in ((c, "1.0.0, joint-x2 02"), (d, "1.0.1, joint-x2 01")):
+        note = note_on_weights(open_comparison([a, other], render))
+        assert note == f"Different versions or weights made these: {a} (1.0.0, joint-x2 01); {other} ({maker})"
 
 
 def part_of(path, truth, x0, y0, width, height):

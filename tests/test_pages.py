@@ -19,12 +19,14 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from unittest.mock import MagicMock
 
 import pytest
 
+import oiio_msspl
 from oiio_msspl.aovs.renderers import renderers
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,7 +49,8 @@ NOT_RUN = {
     "mypy": "continuous integration runs it",
     "lint-imports": "continuous integration runs it",
     "msspl-render": "needs Blender",
-    "blender": "needs Blender",
+    "msspl blender-install": "needs Blender",
+    "python blender_addon/build_zip.py": "tests/blender_addon/test_install.py builds it",
     "dask": "runs until it is stopped; tests/jobs/test_dask_cluster.py starts a scheduler and workers",
     "deadline": "needs a farm",
     "python -m research.training": "needs rendered views and hours",
@@ -169,10 +172,10 @@ def test_commands_that_are_not_run_are_accepted(
         assert all((ROOT / word).exists() for word in words[3:] if word.startswith("tests"))
     elif words[:2] == ["python", "-m"]:
         check_arguments(words[2], words[3:], monkeypatch)
+    elif words[0] == "python" and words[1].endswith("build_zip.py"):
+        assert (ROOT / words[1]).is_file()
     elif words[0] == "python":
         check_arguments(words[1], words[2:], monkeypatch)
-    elif words[0] == "blender":
-        assert (ROOT / words[words.index("--source-dir") + 1] / "blender_manifest.toml").is_file()
     elif words[0] == "deadline":
         assert any(f"--bundle {words[-1]}" in line for line in block.commands), f"no command above writes {words[-1]}"
     else:  # the options are checked before the help is printed
@@ -268,6 +271,14 @@ def test_links_lead_somewhere(page: Path) -> None:
         file = (page.parent / path).resolve() if path else page
         assert file.exists(), target
         assert not anchor or anchor in anchors(file), f"{target}: no such heading"
+
+
+def test_every_public_name_is_on_the_page_about_python() -> None:
+    page = (ROOT / "docs/api.md").read_text(encoding="utf-8")
+    names = [line.rpartition(".") for line in re.findall(r"^::: (\S+)$", page, re.MULTILINE)]
+    assert {name for _, _, name in names} == set(oiio_msspl.__all__) - {"__version__"}
+    for module, _, name in names:
+        assert getattr(import_module(module), name) is getattr(oiio_msspl, name)
 
 
 def test_every_renderer_of_the_table_is_on_the_page() -> None:

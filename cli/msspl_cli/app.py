@@ -7,9 +7,9 @@ from typing import Any
 
 import typer
 
-from msspl_cli.commands import check, compare, fuse, inspect, models, nuke_install, render, submit
+from msspl_cli.commands import blender_install, check, compare, fuse, inspect, models, nuke_install, render, submit
 from msspl_cli.errors import run
-from oiio_msspl import __version__
+from oiio_msspl._version import full_version
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -31,7 +31,7 @@ app = typer.Typer(no_args_is_help=True, **_SETTINGS)
 def _main(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
     """Inspect renders, list models and compare results. To fuse a pair, see [bold]msspl-fuse --help[/bold]."""
     if version:
-        print(__version__)
+        print(full_version())
         raise typer.Exit
 
 
@@ -40,7 +40,8 @@ app.command(epilog=check.EXAMPLES)(check.check)
 app.command(epilog=models.EXAMPLES)(models.models)
 app.command(epilog=compare.EXAMPLES)(compare.compare)
 app.command(epilog=fuse.EXAMPLES)(fuse.fuse)
-app.command(epilog=submit.EXAMPLES, options_metavar=submit.USAGE, context_settings=submit.SETTINGS)(submit.submit)
+app.command(epilog=submit.EXAMPLES)(submit.submit)
+app.command("blender-install", epilog=blender_install.EXAMPLES)(blender_install.blender_install)
 app.command("nuke-install", epilog=nuke_install.EXAMPLES)(nuke_install.nuke_install)
 
 

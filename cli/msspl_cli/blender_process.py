@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from msspl_cli.installed import shipped_folder
+from msspl_cli.extension import find_extension
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import temporary_folder
 
@@ -101,7 +101,7 @@ def render_frames(
 
 def command(program: str, scene: Path, job: Path) -> list[str]:
     """Return the arguments that make Blender, or a Python that has bpy, do the job of a file."""
-    script = str(shipped_folder("blender_addon") / "headless.py")
+    script = str(find_extension() / "headless.py")
     if Path(program).name.lower().startswith("python"):
         return [program, "-P", script, str(job)]  # -P: modules beside the script must not hide others
     return [program, "--background", str(scene.absolute()), "--python", script, "--", str(job)]

@@ -29,6 +29,13 @@ from oiio_msspl.image.arrays import Array, unload
 oiio.attribute("limits:channels", 1 << 16)
 oiio.attribute("limits:imagesize_MB", 0)
 
+#: Scan lines that OpenEXR compresses together; one with the compressions that are not here.
+ROWS_PER_CHUNK = {
+    **dict.fromkeys(("zip", "pxr24"), 16),
+    **dict.fromkeys(("piz", "b44", "b44a", "dwaa", "htj2k32"), 32),
+    **dict.fromkeys(("dwab", "htj2k256"), 256),
+}
+
 #: Characters of OpenImageIO's error messages that are quoted. A damaged header may be quoted in one.
 LONGEST_REASON = 200
 
@@ -85,7 +92,7 @@ class Part:
     @property
     def strip_height(self) -> int:
         """Rows that are decoded together: whole tiles, or whole chunks of scan lines; fewer with many channels."""
-        unit = self.tile[1] or self.spec.get_int_attribute("oiio:RowsPerChunk", 1)
+        unit = self.tile[1] or ROWS_PER_CHUNK.get(self.compression, 1)
         row_bytes = self.nbytes // max(1, self.data_window.height)
         return unit * max(1, min(ROWS_PER_STRIP, LARGEST_STRIP // max(1, row_bytes)) // unit)
 

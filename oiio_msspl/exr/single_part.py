@@ -121,7 +121,8 @@ def _header(contents: FileContents) -> dict[str, Any]:
 
     path = contents.source.path
     try:
-        with OpenEXR.File(str(path), header_only=True) as source:
+        # OpenEXR 3.3 returns no parts without their pixels.
+        with OpenEXR.File(str(path), header_only=not OpenEXR.__version__.startswith("3.3.")) as source:
             header = dict(source.parts[contents.home.index].header)
             for part, _ in _passed_on(contents):  # such as Cryptomatte's manifests
                 passed_on = source.parts[part.index].header

@@ -4,18 +4,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target
 from oiio_msspl.exr.preview import is_our_preview
+from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.jobs.inputs import files_by_name
 from oiio_msspl.jobs.plan import ShotPlan
+from oiio_msspl.jobs.report import WEIGHTS_ATTRIBUTE
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, older_than, result_of
+from oiio_msspl.model.catalogue import model_files
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.digests import as_text, digests
 
 #: Seconds by which the clocks of two machines may differ.
 CLOCK_SKEW = 60
@@ -82,6 +87,26 @@ class ExistingResults:
             return result_of(files, FAILED, str(error), error.exit_code)
         return None
 
+    def check_weights(self, skipped: Iterable[FrameFiles]) -> None:
+        """Check that frames that are skipped were fused by the weights that fuse the others now.
+
+        An EXR without the digests of its weights passes: another program, or a version before 1.0, has written it.
+
+        Raises:
+            InputError: other weights made a frame.
+        """
+        model, device = self.settings.model, self.settings.device
+        for files in skipped:
+            scale, made_by = _made_by(files.output)
+            if scale not in SCALES or not made_by:
+                continue
+            now = as_text(digests(model_files(scale, model), device))
+            if made_by != now:
+                raise InputError(
+                    f"{files.output}: was fused by other weights ({made_by}) than the frames that are missing would be "
+                    f"({now}); pass --overwrite to fuse all frames again, or name the model and device of the first run"
+                )
+
     def _check_targets(self, files: FrameFiles) -> None:
         """Raise InputError if a result can't be written."""
         overwrite = self.replaces(files)
@@ -92,3 +117,13 @@ class ExistingResults:
         check_target(files.output, overwrite=overwrite)
         if files.preview is not None:
             check_target(files.preview, overwrite=self.replaces_preview(files.preview))
+
+
+def _made_by(path: Path) -> tuple[int, str]:
+    """Return the scale and the weights in the header of a fused EXR; 0 and nothing if it does not say."""
+    try:
+        file = open_exr(path)
+        file.close()
+        return int(file.metadata["msspl/scale"]), file.metadata[WEIGHTS_ATTRIBUTE]
+    except (InputError, KeyError, ValueError):
+        return 0, ""

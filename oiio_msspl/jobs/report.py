@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl._version import __version__
+from oiio_msspl._version import full_version
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
@@ -22,10 +22,13 @@ from oiio_msspl.exr.layers import layer_by_channel, layers_of
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import ONE_SIZE, Contract
+from oiio_msspl.model.digests import as_text
 from oiio_msspl.model.session import Session
 
 #: Samples of the LRHS below which a pair gets a warning, as a share of those of the HRLS, both per pixel of the frame.
 LEAST_SHARE = 1 / 8
+#: The attribute of a fused EXR that holds the digests of the weights, as :func:`.digests.as_text` writes them.
+WEIGHTS_ATTRIBUTE = "msspl/weights"
 
 
 @dataclass(repr=False)
@@ -36,6 +39,8 @@ class FrameReport:
     hr: MappedRender
     scale: int
     model: str
+    weights: dict[str, str]
+    """The digests of the model and of those that fuse passes, by name."""
     provider: str
     """The ONNX Runtime execution provider that ran the model."""
     convolutions: dict[str, int]
@@ -128,6 +133,7 @@ class FrameReport:
             "scale": self.scale,
             "spp": {"lrhs": None if self.is_one_render else self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
+            "weights": self.weights,
             "provider": self.provider,
             "convolutions": self.convolutions,
             "aovs": self.aovs(),
@@ -143,7 +149,7 @@ class FrameReport:
             "frames_counted": None if self.frames_counted is None else round(self.frames_counted, 2),
             "tiles": self.tiles,
             "seconds": {k: round(v, 3) for k, v in self.seconds.items()},
-            "version": __version__,
+            "version": full_version(),
         }
 
 
@@ -156,6 +162,7 @@ def report_on(
         hr=hr.for_model(session.contract.hrls),
         scale=fused.alignment.scale,
         model=session.name,
+        weights=session.weights,
         provider=session.provider,
         convolutions=session.convolutions,
         output=output,
@@ -275,8 +282,10 @@ def provenance(report: FrameReport) -> dict[str, str]:
         (views if report.other_views else {})
         | second
         | {
-            "msspl/version": __version__,
+            "msspl/version": full_version(),
             "msspl/model": report.model,
+            WEIGHTS_ATTRIBUTE: as_text(report.weights),
+            "msspl/provider": report.provider,
             "msspl/scale": str(report.scale),
             "msspl/hrls": hrls,
             "msspl/spp_hrls": _spp(report.hr.spp),

@@ -95,7 +95,8 @@ def fuse_shot(
         The result of every frame.
 
     Raises:
-        InputError: no frame could be fused: there are none, the output can't be written, or an option is wrong.
+        InputError: no frame could be fused: there are none, the output can't be written, an option is wrong, or other
+            weights made the frames that ``skip_existing`` keeps.
         MssplError: the report can't be written.
     """
     start = time.perf_counter()
@@ -126,6 +127,7 @@ def fuse_shot(
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model))
+        ExistingResults(settings, plan).check_weights(running.skipped())
         report.found = look_ahead(to_fuse, settings)
         if client is None and report.found is not None:
             settings.session(report.found["scale"])  # a model that can't be used is refused before anything is told
@@ -189,6 +191,12 @@ class _RunningReport:
         if first is not None and first["frame"] in {frame.number for frame in to_fuse}:
             self.report.first = None  # its result is replaced
         return to_fuse
+
+    def skipped(self) -> list[FrameFiles]:
+        """Return the frames that are skipped so far."""
+        results = self.report.results
+        numbers = {number for number, result in results.items() if result.status == SKIPPED}
+        return [frame for frame in self.report.shot.frames if frame.number in numbers]
 
     def add_outcome(self, frame: FrameFiles, outcome: dict[str, Any] | Exception | None) -> None:
         """Add the result of a frame: from its report, the reason for its failure, or None if its EXR existed."""

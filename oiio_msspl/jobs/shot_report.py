@@ -11,15 +11,19 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from oiio_msspl._version import __version__
+from oiio_msspl._version import full_version
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, replacing
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
+from oiio_msspl.model.digests import as_text
 
 #: The keys that are read of ``first_fused`` in an earlier report. If a report of another version lacks some of them,
 #: frames are compared with the first one that this run fuses.
-FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "size", "scale", "model", "aovs", "layers", "notes", "passes"}
+FIRST_FUSED = {
+    *("frame", "neighbours", "renderer", "view", "size", "scale", "model", "weights", "version"),
+    *("aovs", "layers", "notes", "passes"),
+}
 
 #: A frame stands alone if a pixel counts fewer frames than this, in the mean.
 ALONE = 1.1
@@ -131,7 +135,7 @@ class ShotReport:
             "frames_counted": None if self.frames_counted is None else round(self.frames_counted, 2),
             "first_fused": self.first,
             "frames": entries,
-            "version": __version__,
+            "version": full_version(),
         }
 
     def save(self, path: Path) -> None:
@@ -183,7 +187,7 @@ def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
 
 
 def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """Compare the features, the size, the scale, the model and the number of neighbours."""
+    """Compare the features, the size, the scale, the model and its weights, the version and the neighbours."""
     words = {"default": "not found", "absent": "not found"}
     before, now = (
         {row["feature"]: words.get(row["status"], row["status"]) for row in report["aovs"] if row["status"] != "unused"}
@@ -194,6 +198,9 @@ def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
     pairs["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
     if here["scale"] == first["scale"]:  # each scale has models of its own
         pairs["the model"] = here["model"], first["model"]
+    if here["model"] == first["model"]:
+        pairs["the digest of its weights"] = as_text(here["weights"]), as_text(first["weights"])
+    pairs["the version"] = here["version"], first["version"]
     pairs["--temporal"] = str(here["neighbours"] or "off"), str(first["neighbours"] or "off")
     return [f"{what} is {state} here and {earlier}" for what, (state, earlier) in pairs.items() if state != earlier]
 

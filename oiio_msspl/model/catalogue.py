@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
-import re
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
@@ -27,23 +25,6 @@ AUTO, DEFAULT_QUALITY = "auto", "balanced"
 def shipped_models() -> dict[str, Path]:
     """Return the ONNX files of all models for renders inside the package, by name (``paper-x4``)."""
     return {path.stem: path for path in sorted(WEIGHTS.glob("*.onnx")) if not path.stem.startswith(MEAN_MODEL)}
-
-
-def digest(path: Path) -> str:
-    """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the weights that it reads.
-
-    Args:
-        path: the ONNX file. The other files, ``*.weights`` or models at x2, lie beside it and are read in the order of
-            their names.
-
-    Raises:
-        FileNotFoundError: the ONNX file or one of its weights files is missing.
-    """
-    content = path.read_bytes()
-    made = hashlib.sha256(content)
-    for name in sorted(set(re.findall(rb"[\w.-]+\.weights|[\w-]+-x2\.onnx", content))):
-        made.update((path.parent / name.decode()).read_bytes())
-    return made.hexdigest()[:12]
 
 
 def measured() -> dict[str, dict[str, float]]:
@@ -102,17 +83,26 @@ def find_model(scale: int, name: str | None = None) -> Path:
     raise InputError(f"no model {name!r}: neither a file nor one of {', '.join([*families, *models])}")
 
 
+def model_files(scale: int, name: str | None = None) -> list[Path]:
+    """Return the ONNX files that fuse frames: the model of :func:`find_model`, and those that fuse passes beside it.
+
+    Only models of quality ``best`` fuse passes by a network: by a fast one, because there are many passes. At x2
+    another one fuses passes at half of the frame's resolution.
+    """
+    path = find_model(scale, name)
+    endings = {WEIGHTS / f"{QUALITIES['best']}{ending}-x{scale}.onnx": ending for ending in ("", SPREAD)}
+    if path not in endings:
+        return [path]
+    half = [WEIGHTS / f"{MEAN_MODEL}{endings[path]}-x1.onnx"] if scale == 2 else []
+    return [path, find_model(scale, QUALITIES["fast"] + endings[path]), *half]
+
+
 def load_model(scale: int, name: str | None = None, device: str = "cpu", threads: int = 0) -> Session:
     """Load a model of :func:`find_model` as a :class:`oiio_msspl.model.session.Session`.
 
     Raises:
         InputError: there is no such model, or it can't run on this device.
     """
-    path = find_model(scale, name)
-    # Only models of quality "best" fuse passes by a network: by a fast one, because there are many passes.
-    endings = {WEIGHTS / f"{QUALITIES['best']}{ending}-x{scale}.onnx": ending for ending in ("", SPREAD)}
-    if path not in endings:
-        return Session(path, device, threads)
-    family = QUALITIES["fast"] + endings[path]
-    half = WEIGHTS / f"{MEAN_MODEL}{endings[path]}-x1.onnx" if scale == 2 else None
-    return Session(path, device, threads, layers=find_model(scale, family), half_layers=half)
+    path, layers, half_layers = [*model_files(scale, name), None, None][:3]
+    assert path is not None
+    return Session(path, device, threads, layers=layers, half_layers=half_layers)

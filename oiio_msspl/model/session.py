@@ -17,6 +17,7 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.image.parallel import check_threads
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
+from oiio_msspl.model.digests import digests
 from oiio_msspl.model.encoding import default_value
 from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.runtime import CPU, convolutions, load_network, release_memory
@@ -92,6 +93,11 @@ class Session:
     def name(self) -> str:
         """The model's name, as ``--model`` takes it."""
         return self.contract.name
+
+    @functools.cached_property
+    def weights(self) -> dict[str, str]:
+        """The digests of this model and of those that fuse passes, by name."""
+        return digests([path for path in (self.path, self.layers, self.half_layers) if path], self.device)
 
     def require_error(self) -> None:
         """Raise InputError if the model does not predict its error."""

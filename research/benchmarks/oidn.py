@@ -5,8 +5,8 @@ Images are (h, w, 3) and linear. All functions need pyoidn: ``pip install '.[ben
 
     python -m research.benchmarks.oidn FRAME.exr DENOISED.exr
 
-denoises a file as the documentation recommends. The file has the layers RGB, ``albedo`` and ``N``. This program is
-timed beside ours, so it imports nothing of this project.
+denoises a file as the documentation recommends. The file has the beauty and the layers ``albedo`` and ``N``. This
+program is timed beside ours, so it imports nothing of this project.
 """
 
 from __future__ import annotations
@@ -101,9 +101,14 @@ def denoise_file(source: str, target: str) -> None:
     """Denoise an EXR file by the recommended call; write the beauty as half floats."""
     import OpenEXR
 
-    with OpenEXR.File(source) as file:
-        layers = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    beauty = denoise_prefiltered(layers["RGB"], layers["albedo"], layers["N"])
+    with OpenEXR.File(source, separate_channels=True) as file:
+        planes = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+
+    def layer(prefix: str) -> Array:
+        letters = "XYZ" if f"{prefix}X" in planes else "RGB"
+        return np.stack([planes[prefix + letter] for letter in letters], axis=-1)
+
+    beauty = denoise_prefiltered(layer(""), layer("albedo."), layer("N."))
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGB": np.maximum(beauty, 0).astype(np.float16)}) as file:
         file.write(target)

@@ -13,13 +13,13 @@ import datetime
 import functools
 import platform
 import re
-import subprocess
 from collections.abc import Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from oiio_msspl._version import __version__
-from oiio_msspl.model.catalogue import WEIGHTS, digest
+from oiio_msspl._version import full_version
+from oiio_msspl.model.catalogue import WEIGHTS
+from oiio_msspl.model.digests import digest
 
 FOLDER = Path(__file__).parent / "results"
 #: In the column `scene`: the mean over all scenes whose reference is clean.
@@ -84,7 +84,8 @@ def stamp(model: str | None = None, machine: str | None = None) -> Row:
         machine: what computes; by default the processor.
     """
     used = {"model": model, "digest": shipped_digest(model)} if model else {}
-    return used | {"version": version(), "machine": machine or processor(), "date": datetime.date.today().isoformat()}
+    today = datetime.date.today().isoformat()
+    return used | {"version": full_version(), "machine": machine or processor(), "date": today}
 
 
 def oldest_stamp(rows: Iterable[Row]) -> Row:
@@ -98,14 +99,6 @@ def shipped_digest(model: str) -> str | None:
     """Return the digest of a model that ships now; None if it does not ship (any more)."""
     path = WEIGHTS / f"{model}.onnx"
     return digest(path) if path.exists() else None
-
-
-@functools.cache
-def version() -> str:
-    """Return the package's version, with the commit if it runs in a checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    return f"{__version__}+{done.stdout.strip()}" if done.returncode == 0 else __version__
 
 
 def model_of(method: str) -> Row:

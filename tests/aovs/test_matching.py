@@ -187,6 +187,14 @@ def test_encoded_normals_are_recognised_by_their_pixels(tmp_path):
         np.testing.assert_allclose(render.read(render.data_window)["normal"], normal, atol=1e-6)
 
 
+def test_signed_normals_that_all_point_one_way_are_left_alone(tmp_path):
+    """Such as those of a camera above the ground: no component is negative."""
+    normal = np.abs(np.random.default_rng(0).normal(size=(H, W, 3)))
+    normal = (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+    render = mapped(tmp_path, layer("", 1) | rgb(normal, "normal."))
+    np.testing.assert_array_equal(render.read(render.data_window)["normal"], normal)
+
+
 def test_encoded_normals_are_recognised_wherever_there_is_a_surface(tmp_path):
     """The sky fills the middle of the frame, where the normal is black."""
     stored = np.zeros((400, W, 3), np.float32)

@@ -83,11 +83,13 @@ def test_programs_tell_their_version(program):
     assert (done.returncode, done.stdout) == (0, f"{__version__}\n")
 
 
-def test_help_all_of_submit_lists_the_options_of_msspl_fuse():
-    for arguments in ((), ("--bundle", "x")):
-        done = run("msspl", "submit", *arguments, "--help-all")
-        assert done.returncode == 0
-        assert {"--scheduler", "--half", "--layout"} <= options_in(done.stdout)
+def test_submit_has_the_options_of_msspl_fuse_that_a_job_can_have():
+    fuse, submit = (
+        options_in(run(program, *command, "--help-all").stdout)
+        for program, command in (("msspl_fuse", ()), ("msspl", ("submit",)))
+    )
+    assert fuse - submit == {"--overwrite", "--json", "--report", "--progress", "--scheduler"}
+    assert submit - fuse == {"--bundle", "--chunk", "--timeout"}
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 from msspl_cli.blender_process import command, find_blender
 from msspl_cli.commands.render import _Printer, name_targets
-from msspl_cli.installed import shipped_folder
+from msspl_cli.extension import find_extension
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import temporary_folder
@@ -35,7 +35,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Blender 
 
 
 def test_a_blender_and_a_python_with_bpy_are_started_differently():
-    job, script = Path("job.json"), str(shipped_folder("blender_addon") / "headless.py")
+    job, script = Path("job.json"), str(find_extension() / "headless.py")
     scene = Path("/a/scene.blend")
     assert command("/opt/blender", scene, job) == [
         *("/opt/blender", "--background", "/a/scene.blend", "--python", script, "--", "job.json")

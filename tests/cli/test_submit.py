@@ -14,8 +14,8 @@ from tests.shots import HEIGHT, WIDTH, layers, make_shot
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["lr", "hr", "-o", "out", "--overwrite"], "--overwrite has no meaning in a job"),
-        (["lr", "hr", "-o", "out", "--json"], "--json has no meaning in a job"),
+        (["lr", "hr", "-o", "out", "--overwrite"], "No such option"),
+        (["lr", "hr", "-o", "out", "--json"], "No such option"),
         (["lr", "hr", "-o", "out", "--layout", "x"], "--layout 'x': use one of"),
         (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
         (["lr", "hr", "-o", "out", "--model", "text.onnx"], "text.onnx: onnxruntime can't load it"),

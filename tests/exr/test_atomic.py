@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A file appears whole or not at all."""
 
+import errno
 import os
+import re
 import sys
 import time
 
 import pytest
 
-from oiio_msspl.errors import InputError
+from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr import atomic
 from oiio_msspl.exr.atomic import check_separate, check_target, make_folder, remove_leftovers, replacing
 from tests.programs import leave_temporary
@@ -158,3 +160,69 @@ def test_the_folder_of_a_links_target_must_exist(tmp_path):
         check_target(link, overwrite=True)
     (tmp_path / "gone").mkdir()
     assert check_target(link, overwrite=True) == link
+
+
+def test_pixels_are_on_the_disk_before_a_file_gets_its_name(tmp_path, monkeypatch):
+    """A crash of the machine leaves the old file or the whole new one."""
+    calls = []
+    for name in ("fsync", "replace", "link"):
+        call = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, name=name, call=call, **k: (calls.append(name), call(*a, **k))[1])
+    for overwrite, naming in ((False, "link"), (True, "replace")):
+        with replacing(tmp_path / "out.exr", overwrite=overwrite) as temporary:
+            temporary.write_text("new")
+        assert calls == ["fsync", naming]
+        calls.clear()
+
+
+# ------------------------------------------------------------------------------------------- other systems
+
+
+def test_without_hard_links_a_file_is_renamed_unless_another_has_appeared(tmp_path, monkeypatch):
+    """As on FAT, exFAT and some network shares."""
+
+    def unknown(*arguments):
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(os, "link", unknown)
+    with replacing(tmp_path / "out.exr") as temporary:
+        temporary.write_text("ours")
+    assert (tmp_path / "out.exr").read_text() == "ours"
+    with pytest.raises(InputError, match="appeared while this was computed"), replacing(tmp_path / "out.exr") as again:
+        again.write_text("later")
+    assert (tmp_path / "out.exr").read_text() == "ours" and os.listdir(tmp_path) == ["out.exr"]
+
+
+def test_a_target_that_another_program_holds_open_is_told_and_left_as_it_was(tmp_path, monkeypatch):
+    """Windows refuses to rename onto such a file."""
+
+    def refused(*arguments):
+        raise PermissionError(errno.EACCES, "The process cannot access the file")
+
+    (tmp_path / "out.exr").write_text("old")
+    monkeypatch.setattr(os, "replace", refused)
+    with (
+        pytest.raises(MssplError, match=r"out.exr: can't be written \(The process cannot .* the target is as it was"),
+        replacing(tmp_path / "out.exr", overwrite=True) as temporary,
+    ):
+        temporary.write_text("new")
+    assert (tmp_path / "out.exr").read_text() == "old" and os.listdir(tmp_path) == ["out.exr"]
+
+
+def test_on_windows_only_the_age_of_a_temporary_file_counts(tmp_path, monkeypatch):
+    """There, os.kill(process, 0) would end the process."""
+    target = tmp_path / "out.exr"
+    new, old = leave_temporary(target), leave_temporary(target)
+    os.utime(old, (time.time() - 25 * 3600,) * 2)
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(os, "kill", lambda *arguments: pytest.fail("would end a process"))
+    remove_leftovers([target])
+    assert list(tmp_path.iterdir()) == [new]
+
+
+def test_a_machine_has_a_name_without_the_files_of_linux(monkeypatch):
+    def missing(*arguments, **options):
+        raise FileNotFoundError
+
+    monkeypatch.setattr(atomic.Path, "read_text", missing)
+    assert re.fullmatch("[0-9a-f]{8}", atomic._machine.__wrapped__())

@@ -8,7 +8,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import check_layout, write_fused
-from tests.conftest import picture, rgb, write_exr
+from tests.conftest import HEADER_ONLY, picture, rgb, write_exr
 from tests.exr.sources import H, W, everything, stereo, written
 
 
@@ -65,8 +65,9 @@ def test_metadata_of_all_parts_is_kept(tmp_path):
         options = WriteOptions(layout="multilayer", layers=layers)
         out = tmp_path / f"{len(layers)}.exr"
         write_fused(out, hr.file, hr.beauty_channels, np.ones((H, W, 3), np.float32), None, {}, options)
-        with OpenEXR.File(str(out), header_only=True) as file:
+        with OpenEXR.File(str(out), header_only=HEADER_ONLY) as file:
             written_header = dict(file.parts[0].header)
         assert (written_header["comments"], written_header["far"]) == ("beauty", 10)
-        assert not written_header.keys() & {"view", "name"}
+        assert "view" not in written_header
+        assert written_header.get("name", "Part0") == "Part0"  # a name that OpenEXR 3.3 makes up
         assert (manifest.items() <= written_header.items()) == is_kept

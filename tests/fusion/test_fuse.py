@@ -443,6 +443,17 @@ def test_alpha_is_fused_and_exact_where_both_agree(session, scale):
     assert alpha.max() <= 1
 
 
+def test_alpha_is_exact_only_if_the_pixels_around_agree(bilinear_models):
+    """A pixel beside the edge gets the network's soft alpha, and one further inside is exactly 1."""
+    low, high, _ = pair_of(4)
+    coverage = np.zeros((96, 128, 1), np.float32)
+    coverage[:, 64:] = 1
+    high.layers["alpha"], low.layers["alpha"] = coverage, downsample(coverage, 4)
+    alpha = fuse(low, high, Session(bilinear_models[4])).alpha[40, :, 0]
+    assert 0 < alpha[63] < alpha[64] < 1
+    assert (alpha[:63] == 0).all() and (alpha[65:] == 1).all()
+
+
 def test_a_surface_is_solid_up_to_its_edge(scale):
     """The network makes the edge soft, as in the LRHS. Inside of the surface, both renders are sure."""
     session = Session(find_model(scale, "joint"))

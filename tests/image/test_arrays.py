@@ -2,6 +2,7 @@
 """Where images are stored."""
 
 import errno
+import mmap
 import os
 from pathlib import Path
 
@@ -65,3 +66,12 @@ def test_images_are_black_on_disks_that_can_not_take_room_in_advance(monkeypatch
     assert image.shape == (20, 30, 3) and not image.any()
     image[19, 29] = 1
     assert image.sum() == 3
+
+
+def test_an_image_in_a_file_keeps_its_pixels_where_memory_can_not_be_given_back(monkeypatch):
+    """As on Windows, whose memory maps take no advice."""
+    monkeypatch.delattr(mmap, "MADV_DONTNEED", raising=False)
+    image = arrays.blank((20, 30, 3), on_disk=True)
+    image[:] = 7
+    arrays.unload(image)
+    assert (image == 7).all()

@@ -216,3 +216,9 @@ def test_one_ahead_has_ended_when_its_caller_fails():
     with limit_threads(2), pytest.raises(ValueError, match="no tile"):
         fail()
     assert ended.is_set()
+
+
+def test_all_cores_are_used_where_a_process_can_not_ask_for_its_own(monkeypatch):
+    """As on macOS and Windows."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    assert parallel.available_cores() == os.cpu_count()

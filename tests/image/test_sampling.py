@@ -37,3 +37,13 @@ def test_only_valid_positions_are_interpolated(monkeypatch):
     (found,) = sample(monkeypatch, 0.8, [image], x, y, valid)
     assert np.array_equal(found[valid], everywhere[valid])
     assert np.isin(found[~valid], image).all()
+
+
+def test_a_sample_stays_between_the_four_nearest_pixels(monkeypatch):
+    """Keys' cubic would overshoot beside an edge."""
+    image = np.zeros((HEIGHT, WIDTH, 1), np.float32)
+    image[:, WIDTH // 2 :] = 1
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    (found,) = sample(monkeypatch, 0, [image], x + np.float32(0.3), y)
+    assert found.min() == 0 and found.max() == 1
+    assert 0 < found[5, WIDTH // 2 - 1, 0] < 1

@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import pytest
 
 from oiio_msspl import Contract, InputOptions, fuse_files
+from oiio_msspl._version import full_version
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.jobs.report import provenance, spp_warnings
+from oiio_msspl.model.digests import digest
 from tests.conftest import write_exr
 from tests.shots import layers, low_layers
 
@@ -65,10 +67,15 @@ def test_a_feature_of_the_file_that_the_model_does_not_read_is_unused(report_of)
     assert "variance" not in rows
 
 
-def test_the_exr_says_what_it_was_made_from(report_of):
+def test_the_exr_says_what_it_was_made_from(report_of, bilinear_models):
     report = report_of(64, 2)
     stored = open_exr(report.output).metadata
     for name, value in provenance(report).items():
         assert stored[name] == value
     assert stored["msspl/spp_average"] == "6"
+    assert stored["msspl/provider"] == "CPUExecutionProvider"
+    model = bilinear_models[4]
+    assert stored["msspl/weights"] == f"{model.stem} {digest(model)}"
+    assert stored["msspl/version"] == report.as_dict()["version"] == full_version()
+    assert report.as_dict()["weights"] == {model.stem: digest(model)}
     assert json.loads(json.dumps(report.as_dict()))["spp"] == {"lrhs": 64, "hrls": 2, "average": 6}

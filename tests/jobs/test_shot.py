@@ -15,6 +15,7 @@ import OpenImageIO as oiio
 import pytest
 
 from oiio_msspl import InputError, InputOptions, MssplError, fuse_files, fuse_shot
+from oiio_msspl._version import full_version
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
@@ -439,10 +440,40 @@ def test_another_model_or_scale_than_that_of_the_first_frame_is_a_warning(tmp_pa
     write_exr(folder / "lr/lr.1003.exr", rgb(downsample(picture(HEIGHT, WIDTH), 2)))
     more = {"skip_existing": True, "report_path": folder / "r.json"}
     assert run(folder, bilinear_models[4], frames="1001", **more).results[1001].warnings == []
-    report = run(folder, "fast", **more)
+    report = run(folder, "fast", frames="1002-1003", **more)
     (same_scale,), (other_scale,) = (report.results[number].warnings for number in (1002, 1003))
     assert same_scale == "the model is joint-small-x4 here and bilinear-x4 in frame 1001: it may flicker"
     assert other_scale == "the scale is x2 here and x4 in frame 1001: it may flicker"
+
+
+def test_a_shot_is_not_resumed_with_other_weights(tmp_path, bilinear_models):
+    """Frames without a digest, and files that are no EXR, do not stop it."""
+    folder = make_shot(tmp_path, 4)
+    run(folder, bilinear_models[4], frames="1001")
+    (folder / "out/beauty.1002.exr").write_text("no EXR")
+    write_exr(folder / "out/beauty.1003.exr", rgb(picture(HEIGHT, WIDTH)))
+    before = contents(folder / "out")
+    with pytest.raises(InputError, match=r"beauty.1001.exr: was fused by other weights \(bilinear-x4 \w{12}\) than"):
+        run(folder, "fast", skip_existing=True)
+    assert contents(folder / "out") == before
+    assert run(folder, bilinear_models[4], skip_existing=True).results[1004].status == "fused"
+    assert run(folder, "fast", overwrite=True).exit_code == 0
+
+
+def test_other_weights_and_another_version_than_those_of_the_first_frame_are_warnings(tmp_path, bilinear_models):
+    """A model of the same name has been retrained between two runs."""
+    folder = make_shot(tmp_path, 2)
+    more = {"skip_existing": True, "report_path": folder / "r.json"}
+    run(folder, bilinear_models[4], frames="1001", **more)
+    report = json.loads((folder / "r.json").read_text())
+    (name,) = report["first_fused"]["weights"]
+    report["first_fused"] |= {"weights": {name: "0" * 12}, "version": "0.9"}
+    (folder / "r.json").write_text(json.dumps(report))
+    weights, version = run(folder, bilinear_models[4], frames="1002", **more).results[1002].warnings
+    assert re.fullmatch(
+        rf"the digest of its weights is {name} \w{{12}} here and {name} 0{{12}} in frame 1001: .*", weights
+    )
+    assert version == f"the version is {full_version()} here and 0.9 in frame 1001: it may flicker"
 
 
 def test_another_number_of_neighbours_than_that_of_the_first_frame_is_a_warning(tmp_path, bilinear_models):

@@ -6,7 +6,14 @@ from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL
 from oiio_msspl.image.arrays import repair
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.model import encoding
-from oiio_msspl.model.encoding import NOISY, decode_radiance, encode_radiance, find_exposure
+from oiio_msspl.model.encoding import (
+    MAX_ENCODED,
+    MAX_RADIANCE,
+    NOISY,
+    decode_radiance,
+    encode_radiance,
+    find_exposure,
+)
 from tests.conftest import noisy, picture
 
 
@@ -122,3 +129,10 @@ def test_expand_stays_finite_for_whatever_a_network_says():
 def test_srgb_follows_the_papers_curve():
     values = srgb(np.array([-1, 0, 0.001, 0.18, 1, 7], np.float32))
     np.testing.assert_allclose(values, [0, 0, 0.01292, 0.4613, 1, 1], atol=1e-4)
+
+
+def test_radiance_beyond_the_largest_is_encoded_as_the_largest():
+    """Otherwise a lamp would leave the range in which networks were trained."""
+    values = np.array([MAX_RADIANCE / 2, MAX_RADIANCE, 2 * MAX_RADIANCE, 1e30], np.float32)
+    below, *others = encode_radiance(values, 1.0)
+    assert below < others[0] == others[1] == others[2] == pytest.approx(MAX_ENCODED)

@@ -70,3 +70,10 @@ def test_a_frame_is_averaged_as_its_parts_suggest_together(same):
     together = find_shares([(rows(lrhs, i, 8), rows(hrls, 2 * i, 16)) for i in range(0, 96, 8)], 1.0)
     assert together["rgb"] == pytest.approx(whole["rgb"], abs=0.02)
     assert together.keys() == whole.keys() == ({"rgb", "albedo"} if same else {"rgb"})
+
+
+def test_neither_render_is_left_out_of_the_mean():
+    clean = 0.5 + 0.3 * picture(64, 64)
+    free, rough = (encode_radiance(image, 1.0) for image in (clean, noisy(clean, 1)))
+    assert lrhs_share(free, rough) == 0.95
+    assert lrhs_share(rough, free) == 0.05

@@ -61,6 +61,7 @@ def compare(
         check_error_map,
         note_on_spaces,
         note_on_views,
+        note_on_weights,
         note_on_windows,
         notes_on_broken,
         open_comparison,
@@ -81,8 +82,8 @@ def compare(
     comparison = open_comparison(images, reference, _layer(mapping))
     if html is not None:
         check_layers(comparison, layers)
-    for note in (note_on_views(comparison), note_on_windows(comparison), note_on_spaces(comparison)):
-        if note:
+    for note_on in (note_on_views, note_on_windows, note_on_spaces, note_on_weights):
+        if note := note_on(comparison):
             console.say(note, error=True)
     results = score_images(comparison) if reference else [{} for _ in images]
     if error_map is not None:

@@ -23,11 +23,13 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
     all. Models with -spread were measured with a filter that spreads each sample.
     Time is a multiple of that of Open Image Denoise, on processors with AMX, with
     VNNI and with neither. Each model reads the beauty and the layers of its row.
+    Digests identify the weights; every fused EXR has them as msspl/weights.
     """
     from oiio_msspl.aovs.features import RGB
     from oiio_msspl.model.catalogue import QUALITIES, measured, shipped_models
     from oiio_msspl.model.contract import SPREAD, Contract
     from oiio_msspl.model.devices import PROVIDERS, gpu_file, usable_devices
+    from oiio_msspl.model.digests import digest
 
     rows: list[dict[str, Any]] = []
     figures, quality_of = measured(), {family: quality for quality, family in QUALITIES.items()}
@@ -43,6 +45,7 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
                 "measured": figures.get(name, {}),
                 "size_mb": round(path.stat().st_size / 1e6, 1),
                 "files": {"cpu": str(path), "gpu": str(for_gpus or path)},
+                "digests": {"cpu": digest(path), "gpu": digest(for_gpus or path)},
                 "training_spp": contract.training_spp,
                 "provenance": contract.provenance,
             }
@@ -51,7 +54,7 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
     if as_json:
         print(json.dumps({"models": rows, "devices": devices}, indent=2))
         return
-    header = ("model", "quality", "PSNR", "RelMSE", "time", "layers", "file for GPUs")
+    header = ("model", "quality", "PSNR", "RelMSE", "time", "layers", "digest", "on GPUs")
     console.table([header, *(_cells(row) for row in rows)], header=True, indent=0)
     print(f"devices: {', '.join(devices)} (of {', '.join(PROVIDERS)})")
 
@@ -63,7 +66,6 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     def values(form: str, *names: str) -> str:
         return " / ".join(form.format(figures[name]) if name in figures else "-" for name in names)
 
-    same_file = row["files"]["gpu"] == row["files"]["cpu"]
     return (
         row["name"],
         row["quality"] or "",
@@ -71,5 +73,6 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         values("{:.4f}", "relmse_2spp", "relmse_8spp"),
         values("{:.2g}", "time_amx", "time_vnni", "time_neither"),
         ", ".join(row["layers"]),
-        "the same" if same_file else "half floats",
+        row["digests"]["cpu"],
+        row["digests"]["gpu"],
     )

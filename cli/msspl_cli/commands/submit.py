@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,10 +14,8 @@ import typer
 
 from msspl_cli import console, options
 from msspl_cli.commands import fuse
-from oiio_msspl.errors import InputError
+from msspl_cli.options import option
 
-#: The command accepts arguments that it does not know. msspl-fuse's own parser reads them.
-SETTINGS = {"allow_extra_args": True, "ignore_unknown_options": True}
 USAGE = "[LR] HR -o OUT --bundle DIR [OPTION]..."
 
 EXAMPLES = """[bold]Examples[/bold]
@@ -28,42 +29,54 @@ EXAMPLES = """[bold]Examples[/bold]
   deadline bundle submit job/
 """
 
-#: Parameters of msspl-fuse that :func:`oiio_msspl.jobs.farm.openjd.make_job` takes itself, or that every task has.
-_TAKEN = {"renders", "output", "frames", "model", "quality", "map_file", "device", "view", "skip_existing"}
+#: The group of its own options in the help text.
+JOB = "Job"
+#: Parameters of msspl-fuse that :func:`oiio_msspl.jobs.farm.openjd.make_job` takes itself, that every task has, or
+#: that are about this command.
+_TAKEN = {
+    *("renders", "output", "frames", "model", "quality", "map_file", "device", "view", "skip_existing"),
+    *("debug", "help_all"),
+}
 #: Parameters of msspl-fuse that a job can't have: a task skips existing frames and reports to the farm.
-_REFUSED = {"overwrite", "report_file", "progress", "as_json", "scheduler"}
-_PATHS = ("output", "map_file")
+_LEFT_OUT = {"overwrite", "report_file", "progress", "as_json", "scheduler"}
 
 
+def _with_options_of_fuse(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the parameters of msspl-fuse, but for ``_LEFT_OUT``, in the place of its ``**given``."""
+    own, fuses = (inspect.signature(function, eval_str=True).parameters for function in (command, fuse.fuse))
+    shared = [parameter for name, parameter in fuses.items() if name not in _LEFT_OUT]
+    parameters = [
+        parameter.replace(kind=parameter.KEYWORD_ONLY)
+        for parameter in [*shared, *own.values()]
+        if parameter.kind != parameter.VAR_KEYWORD
+    ]
+
+    @functools.wraps(command)
+    def with_options(**values: Any) -> None:
+        command(**values)
+
+    with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return with_options
+
+
+@_with_options_of_fuse
 def submit(
     context: typer.Context,
-    bundle: Annotated[Path, typer.Option(metavar="DIR", help="Write to this new folder.", show_default=False)],
-    chunk: Annotated[int, typer.Option(metavar="N", min=1, max=100_000, help="Fuse N frames in each task.")] = 10,
+    bundle: Annotated[Path, option(JOB, "Write to this new folder.", metavar="DIR", show_default=False)],
+    chunk: Annotated[int, option(JOB, "Fuse N frames in each task.", metavar="N", min=1, max=100_000)] = 10,
     timeout: Annotated[
         int,
-        typer.Option(
-            metavar="SECONDS", min=1, max=1_000_000, help="Limit the time of a frame. A task gets N times as long."
-        ),
+        option(JOB, "Limit the time of a frame. A task gets N times as long.", metavar="SECONDS", min=1, max=1_000_000),
     ] = 1800,
-    # Typer splits a short option that it does not know into letters: in -o/path it would find the -h of --help.
-    output: Annotated[str | None, typer.Option("--output", "-o", metavar="OUT", hidden=True)] = None,
-    help_all: Annotated[
-        bool,
-        typer.Option(
-            "--help-all",
-            help="Show the options of msspl-fuse and exit.",
-            is_eager=True,
-            callback=lambda wanted: _parse(["--help-all"]) if wanted else None,
-        ),
-    ] = False,
+    **given: Any,
 ) -> None:
     """Write a shot as a job for a farm: an Open Job Description bundle.
 
-    openjd and Deadline Cloud run it. LR, HR, OUT and all other options are those
-    of [bold]msspl-fuse[/bold]. Each task runs msspl-fuse on N frames. A task that
-    runs again fuses only the frames that do not exist.
+    openjd and Deadline Cloud run it. Each task runs [bold]msspl-fuse[/bold] on N
+    frames with the same options. A task that runs again fuses only the frames
+    that do not exist.
     """
-    given, passed_on = _parse([*context.args, *(() if output is None else ("--output", output))])
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl.image.parallel import limit_threads
     from oiio_msspl.jobs.checks import check_first_pair, check_temporal, check_wanted_outputs
@@ -82,7 +95,13 @@ def submit(
     max_memory = bytes_of(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
     settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view")}
-    settings |= {"inputs": inputs, "model": model, "options": passed_on, "chunk": chunk, "timeout": timeout}
+    settings |= {
+        "inputs": inputs,
+        "model": model,
+        "options": _passed_on(context, given),
+        "chunk": chunk,
+        "timeout": timeout,
+    }
     job = make_job(*options.low_and_high(given["renders"]), given["output"], **settings)
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
     with limit_threads(given["threads"]):
@@ -104,41 +123,23 @@ def submit(
     console.say(f"  deadline bundle submit {shlex.quote(str(bundle))}")
 
 
-def _parse(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
-    """Read arguments as msspl-fuse does.
-
-    Returns:
-        The value of each parameter, and the arguments that every task gets unchanged.
-
-    Raises:
-        InputError: an option that a job can't have.
-    """
-    program = typer.Typer(add_completion=False, rich_markup_mode="rich")
-    program.command()(fuse.fuse)
-    command = typer.main.get_command(program)
-    context = command.make_context("msspl submit", list(arguments))
-    passed_on = []
-    for parameter in command.params:
+def _passed_on(context: typer.Context, given: dict[str, Any]) -> list[str]:
+    """Return the arguments that every task gets: those that are not the default of their option."""
+    defaults = {name: parameter.default for name, parameter in inspect.signature(fuse.fuse).parameters.items()}
+    arguments = []
+    for parameter in context.command.params:
         name = parameter.name or ""
-        value: Any = context.params.get(name)
-        source = context.get_parameter_source(name)
-        if source is None or source.name != "COMMANDLINE" or name in _TAKEN:
+        value: Any = given.get(name)
+        if name not in given or name in _TAKEN or value == defaults[name]:
             continue
-        if name in _REFUSED:
-            raise InputError(
-                f"{parameter.opts[0]} has no meaning in a job: its tasks skip existing frames and report to the farm"
-            )
         if isinstance(value, bool):
-            passed_on.append((parameter.opts if value else parameter.secondary_opts)[0])
-        elif getattr(parameter, "count", False):
-            passed_on += [parameter.opts[0]] * value
+            arguments.append((parameter.opts if value else parameter.secondary_opts)[0])
+        elif name == "verbose":
+            arguments += [parameter.opts[0]] * value
         else:
             for text in value if isinstance(value, list | tuple) else [value]:
-                passed_on += [parameter.opts[0], _full_path(text) if name == "mapping" else str(text)]
-    # Some versions of typer convert paths only when they call the command.
-    paths = {name: Path(context.params[name]) for name in _PATHS if context.params[name] is not None}
-    renders = [Path(path) for path in context.params["renders"]]
-    return context.params | paths | {"renders": renders}, passed_on
+                arguments += [parameter.opts[0], _full_path(text) if name == "mapping" else str(text)]
+    return arguments
 
 
 def _full_path(mapping: str) -> str:

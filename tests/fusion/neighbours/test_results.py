@@ -252,3 +252,10 @@ def test_a_frame_in_another_light_does_not_count(lights):
     result = average_results(frame, [still(others[0])], [still(others[1])])
     assert np.allclose(result.rgb.mean(axis=(0, 1)), frame.rgb.mean(axis=(0, 1)), rtol=0.01)
     assert result.frames.mean() < 1.1
+
+
+def test_frames_that_were_averaged_before_count():
+    """The renders of three frames were averaged, and no fused neighbour is added."""
+    frame = frame_of(texture(), 1)
+    frame.frames = np.full((*frame.rgb.shape[:2], 1), 3, np.float32)
+    assert average_results(frame, [], []).frames == pytest.approx(3)

@@ -66,3 +66,13 @@ def test_display_windows_may_begin_anywhere():
 def test_what_does_not_fit_is_explained(low, high, message):
     with pytest.raises(InputError, match=message):
         align(low, high)
+
+
+@pytest.mark.parametrize(("missing", "fits"), [(1, True), (2, False)])
+def test_a_crop_may_be_rounded_by_one_pixel(missing, fits):
+    high, low = render("hr", 64, 64), render("lr", 16, 16, Window(missing, 0, 16, 16))
+    if fits:
+        assert align(low, high).grid == Window(0, 0, 16, 16)
+        return
+    with pytest.raises(InputError, match="framing differs"):
+        align(low, high)

@@ -7,7 +7,15 @@ import pytest
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.features import TileFeatures
-from oiio_msspl.fusion.tiles.guards import FIREFLY_FACTOR, EmptyRegions, _rare_light, dim_fireflies
+from oiio_msspl.fusion.tiles.guards import (
+    FIREFLY_FACTOR,
+    LIGHT,
+    EmptyRegions,
+    _rare_light,
+    bright_lights,
+    dim_fireflies,
+    is_noise_free,
+)
 
 
 def tile(lrhs, hrls, scale=2):
@@ -116,3 +124,30 @@ def test_tiles_have_the_same_squares():
     for y, x in ((3, 5), (8, 2)):
         part = _rare_light(low[y:, x:], y % 8, x % 8)
         np.testing.assert_array_equal(part[24:, 24:], whole[y + 24 :, x + 24 :])
+
+
+def test_one_pixel_that_differs_is_noise():
+    low, high = np.full((8, 8, 3), 0.5, np.float32), np.full((16, 16, 3), 0.5, np.float32)
+    pair = tile(low, {RGB: high})
+    assert is_noise_free(pair, low, high, 1.0)
+    high[4, 4] = 0.7
+    assert not is_noise_free(pair, low, high, 1.0)
+
+
+def test_black_beside_light_of_the_lrhs_is_not_empty():
+    """The network may spread the light that far."""
+    low, high = np.zeros((8, 8, 3), np.float32), np.zeros((16, 16, 3), np.float32)
+    low[4, 4] = 1
+    empty = EmptyRegions(low, 7).mask(tile(low, {RGB: high}), (slice(0, 8), slice(0, 8)))[..., 0]
+    assert not empty[6:12, 6:12].any()
+    assert empty[:6].all() and empty[12:].all()
+
+
+def test_a_firefly_beside_a_lamp_is_dimmed_by_its_own_lrhs_pixel():
+    """The lamp in the next pixel does not make it believable."""
+    low, high = np.full((8, 8, 3), 0.5, np.float32), np.full((16, 16, 3), 0.5, np.float32)
+    low[4, 4], high[8:10, 8:10] = 2 * LIGHT, 2 * LIGHT
+    high[8, 10] = 2 * LIGHT
+    lights = bright_lights(low, high, 1.0)
+    assert (lights[8:10, 8:10] == 2 * LIGHT).all()
+    assert (lights[8, 10] <= 0.5 * FIREFLY_FACTOR).all()

@@ -118,3 +118,11 @@ def test_a_sequence_without_vectors_has_its_other_files(sequence, tmp_path):
     bare = without_vectors(sequence, tmp_path / "bare")
     assert {path.name for path in bare.folder.iterdir()} == {path.name for path in sequence.folder.iterdir()}
     assert list(load(bare.folder).masks) == list(sequence.masks)
+
+
+def test_a_moved_picture_stays_between_its_pixels():
+    image = np.zeros((8, 12, 1), np.float32)
+    image[:, 6:] = 1
+    moved = warped(image, np.full((8, 12, 2), (0.3, 0), np.float32))
+    assert moved.min() == 0 and moved.max() == 1
+    assert 0 < moved[4, 5, 0] < 1

@@ -3,7 +3,8 @@ import hashlib
 
 import pytest
 
-from oiio_msspl.model.catalogue import digest, shipped_models
+from oiio_msspl.model.catalogue import shipped_models
+from oiio_msspl.model.digests import digest
 
 
 def test_a_digest_depends_on_the_model_and_on_the_weights_that_it_names(tmp_path):

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare this package with Open Image Denoise (OIDN) on scenes that everybody can render: no file is needed.
+
+    python -m research.benchmarks.outsiders OUT --quick
+    python -m research.benchmarks.outsiders OUT --oidn /path/to/another/python
+
+Mitsuba 3 renders the scenes of `research.benchmarks.render.own_scenes`. For n samples per pixel in all, a pair has an
+HRLS of n/2 spp and an LRHS of half its size with as many samples, and OIDN gets an ordinary render with n spp, or the
+HRLS alone. OIDN runs as its documentation recommends: high quality, albedo and normal prefiltered. Seconds are those of
+the whole command. A shot in which the camera moves is scored by its flicker, too.
+
+OUT gets the renders, the results, ``table.csv``, and ``index.html`` with a page of pictures for each scene. A run that
+was stopped continues. ``--oidn`` names a Python with another pyoidn, NumPy and OpenEXR.
+"""
+
+from __future__ import annotations
+
+import argparse
+import html
+import shutil
+import subprocess
+import sys
+import sysconfig
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from oiio_msspl.compare import scores
+from oiio_msspl.image.colour import srgb
+from oiio_msspl.image.parallel import available_cores
+from research.benchmarks import oidn, results
+from research.benchmarks.accuracy import mean_flip
+from research.benchmarks.render.film import write_exr
+from research.benchmarks.render.own_scenes import GROUPS, SCENES, lamps
+from research.benchmarks.shots.measures import flicker
+from research.datagen.mitsuba.start import start as start_mitsuba
+
+LAYERS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z")
+MOTION = ("motionFore.X", "motionFore.Y")
+QUALITIES = ("fast", "balanced", "best")
+#: Methods that denoise one render: its file in the folder of a pair.
+OIDN = {"OIDN on the HRLS": "hr", "OIDN at full resolution": "full"}
+#: Columns that tell rows apart.
+KEYS = ("scene", "filter", "spp", "method")
+SCALE = 2
+SHOT = "shot"
+#: Degrees that the camera of the shot turns from frame to frame, and its horizontal field of view.
+PAN, ANGLE = 0.6, 45.0
+#: Distance of the camera from the middle of a scene.
+DISTANCE = 3.6
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much is measured."""
+
+    size: tuple[int, int]
+    scenes: tuple[str, ...]
+    filters: tuple[str, ...]
+    spp: tuple[int, ...]
+    """Samples per pixel in all: an even number."""
+    frames: int
+    reference: int
+    """Samples per pixel of the references."""
+
+
+FULL = Extent((640, 384), tuple(SCENES), ("box", "gaussian"), (2, 8, 32, 128, 256), 12, 8192)
+QUICK = Extent((192, 128), ("room", "glass", "hair", "lamps", "stars"), ("box",), (2, 8), 3, 256)
+
+
+class Renderer:
+    """Renders the scenes with Mitsuba."""
+
+    def __init__(self, mi: Any, size: tuple[int, int]) -> None:
+        self._mi, self.size = mi, size
+        self._scenes: dict[Any, Any] = {}
+
+    def frame(self, name: str, pixel_filter: str, scale: int, spp: int, seed: str, at: float = 0.0) -> dict[str, Image]:
+        """Render a scene at 1/scale of the size: its layers by channel name, light groups included.
+
+        Args:
+            name: of the scene.
+            pixel_filter: ``box`` or ``gaussian``.
+            scale, spp: of the render.
+            seed: the random numbers follow from it.
+            at: frame of the shot.
+        """
+        if name == "lamps":
+            parts = [self._shoot((name, group), pixel_filter, scale, spp, f"{seed} {group}") for group in GROUPS]
+            layers = parts[0] | {c: np.asarray(parts[0][c] + parts[1][c]) for c in "RGB"}
+            for group, part in zip(GROUPS, parts, strict=True):
+                layers |= {f"lg_{group}.{c}": part[c] for c in "RGB"}
+            return layers
+        return self._shoot((name, None), pixel_filter, scale, spp, seed, at)
+
+    def _shoot(
+        self, key: tuple[str, str | None], pixel_filter: str, scale: int, spp: int, seed: str, at: float = 0.0
+    ) -> dict[str, Image]:
+        mi = self._mi
+        if key not in self._scenes:
+            name, group = key
+            build = {"type": "scene", **(lamps(mi, group) if group else SCENES[name if name != SHOT else "room"](mi))}
+            self._scenes[key] = mi.load_dict(build)
+        path = {"type": "volpath" if key[0] == "fog" else "path", "max_depth": 12}
+        integrator = mi.load_dict({"type": "aov", "aovs": "a:albedo,n:sh_normal,p:position", "image": path})
+        width, height = (side // scale for side in self.size)
+        film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": pixel_filter}}
+        lens = {"type": "thinlens", "aperture_radius": 0.06, "focus_distance": DISTANCE}
+        sensor = mi.load_dict({
+            **(lens if key[0] == "foliage" else {"type": "perspective"}),
+            "fov": ANGLE,
+            "to_world": mi.ScalarTransform4f(_camera(at)),
+            "film": film | {"pixel_format": "rgb"},
+        })  # fmt: skip
+        number = zlib.crc32(seed.encode()) & 0x7FFFFFFF
+        image = np.array(mi.render(self._scenes[key], sensor=sensor, integrator=integrator, spp=spp, seed=number))
+        image = np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+        layers = dict(zip(LAYERS, np.moveaxis(image[..., :9], -1, 0), strict=True))
+        if key[0] == SHOT and scale == 1:
+            layers |= dict(zip(MOTION, np.moveaxis(self._motion(image[..., 9:12], at), -1, 0), strict=True))
+        return layers
+
+    def _motion(self, positions: Image, at: float) -> Image:
+        """Return how far each pixel's surface moves to the next frame, in pixels (x, y)."""
+        here, there = (self._project(positions, frame) for frame in (at, at + 1))
+        return np.asarray(there - here, np.float32)
+
+    def _project(self, positions: Image, at: float) -> NDArray[Any]:
+        inverse = np.linalg.inv(_camera(at))
+        seen = positions @ inverse[:3, :3].T + inverse[:3, 3]
+        focal = self.size[0] / 2 / np.tan(np.radians(ANGLE) / 2)
+        return -focal * seen[..., :2] / np.maximum(seen[..., 2:], 1e-3)
+
+
+def _camera(at: float) -> NDArray[Any]:
+    """Return the camera's place (4, 4) at a frame of the shot; it looks along -z, with x to the left as Mitsuba's."""
+    c, s = np.cos(np.radians(PAN * at)), np.sin(np.radians(PAN * at))
+    return np.array([[-c, 0, s, 0.02 * at], [0, 1, 0, 0], [-s, 0, -c, DISTANCE], [0, 0, 0, 1]])
+
+
+def render(renderer: Renderer, extent: Extent, folder: Path, name: str, pixel_filter: str) -> None:
+    """Render the files of a scene that do not exist yet: ``ref``, and ``lr``, ``hr`` and ``full`` for each spp."""
+    frames: Sequence[int | None] = range(1, extent.frames + 1) if name == SHOT else [None]
+    for frame in frames:
+        jobs = [(folder / f"ref{_number(frame)}", 1, extent.reference)]
+        for spp in extent.spp:
+            pair = folder / f"{spp}spp"
+            jobs += [(pair / f"lr{_number(frame)}", SCALE, SCALE**2 * spp // 2)]
+            jobs += [(pair / f"hr{_number(frame)}", 1, spp // 2), (pair / f"full{_number(frame)}", 1, spp)]
+        for path, scale, count in jobs:
+            if not path.exists():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                layers = renderer.frame(name, pixel_filter, scale, count, str(path), float(frame or 0))
+                write_exr(path, np.stack([*layers.values()], axis=-1), [*layers])
+
+
+def _number(frame: int | None) -> str:
+    return ".exr" if frame is None else f".{frame:04}.exr"
+
+
+def measure(
+    folder: Path, name: str, spp: int, done: set[Any], key: tuple[Any, ...], python: str
+) -> Iterator[results.Row]:
+    """Run every method on the renders of a scene that has no row yet, and yield its row.
+
+    Args:
+        folder: of the scene and filter.
+        name, spp: the scene, and samples per pixel in all.
+        done: keys of the rows that exist.
+        key: scene, filter and spp.
+        python: the Python that runs OIDN.
+    """
+    pair, is_shot = folder / f"{spp}spp", name == SHOT
+    fuse = shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or "msspl-fuse"
+    inputs = [str(pair / f"{part}{'.####' if is_shot else ''}.exr") for part in ("lr", "hr")]
+    for method in (*QUALITIES, *OIDN):
+        if (*key, method) in done:
+            continue
+        target = pair / method.replace(" ", "_")
+        target.mkdir(exist_ok=True)
+        out = str(target / ("out.####.exr" if is_shot else "out.exr"))
+        start = time.perf_counter()
+        if method in QUALITIES:
+            _run([fuse, *inputs, "-o", out, "--quality", method, "--overwrite", "--no-preview"])
+        else:
+            for source in sorted(pair.glob(f"{OIDN[method]}.*exr")):
+                _run([python, oidn.__file__, str(source), str(target / source.name.replace(OIDN[method], "out", 1))])
+        seconds = time.perf_counter() - start
+        yield dict(zip(KEYS, (*key, method), strict=True)) | _scores(folder, target) | {"seconds": round(seconds, 2)}
+
+
+def _run(command: Sequence[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)}\n{done.stderr[-2000:]}")
+
+
+def _scores(folder: Path, target: Path) -> dict[str, float]:
+    """Return the mean scores of the results in a folder, and their flicker if they are a shot."""
+    references = [_pixels(path) for path in sorted(folder.glob("ref*.exr"))]
+    images = [_pixels(path) for path in sorted(target.glob("out*.exr"))]
+    rows = [
+        scores(image, reference) | {"flip": mean_flip(image, reference)}
+        for image, reference in zip(images, references, strict=True)
+    ]
+    means = {name: float(np.mean([row[name] for row in rows])) for name in ("psnr", "relmse", "flip")}
+    if len(images) > 1:
+        truth = srgb(np.stack(references))
+        means["flicker"] = flicker(srgb(np.stack(images)), (truth, truth))
+    return means
+
+
+def _pixels(path: Path) -> Image:
+    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT), np.float32)[..., :3]
+
+
+def write_pages(out: Path, rows: Sequence[results.Row]) -> None:
+    """Write a page of pictures for each scene, by ``msspl compare``, and ``index.html`` with the table."""
+    msspl = shutil.which("msspl", path=sysconfig.get_path("scripts")) or "msspl"
+    cells = [
+        "".join(f"<th>{html.escape(name)}</th>" for name in (*KEYS, "psnr", "relmse", "flip", "flicker", "seconds"))
+    ]
+    for row in rows:
+        folder = out / row["scene"] / row["filter"]
+        page = folder / f"{row['spp']}spp.html"
+        if not page.exists():
+            frame = "" if row["scene"] != SHOT else ".0001"
+            images = [*folder.glob(f"{row['spp']}spp/*/out{frame}.exr"), folder / f"{row['spp']}spp/hr{frame}.exr"]
+            reference = str(folder / f"ref{frame}.exr")
+            _run([msspl, "compare", *map(str, sorted(images)), "--reference", reference, "--html", str(page)])
+        link = f'<a href="{page.relative_to(out).as_posix()}">{row["scene"]}</a>'
+        texts = [link, *(html.escape(f"{row[key]}") for key in KEYS[1:])]
+        forms = {"psnr": ".2f", "relmse": ".4f", "flip": ".4f", "flicker": ".4f", "seconds": ".1f"}
+        texts += [f"{row[name]:{form}}" if name in row else "" for name, form in forms.items()]
+        cells.append("".join(f"<td>{text}</td>" for text in texts))
+    style = "body{font:15px sans-serif;margin:2em}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #ccc}"
+    table = "".join(f"<tr>{row}</tr>\n" for row in cells)
+    (out / "index.html").write_text(
+        f"<!doctype html><meta charset=utf-8><title>Pairs and OIDN</title><style>{style}</style>\n"
+        f"<h1>Pairs and OIDN</h1><p>spp: samples per pixel in all. PSNR is better if higher, all others if lower.</p>\n"
+        f"<table>\n{table}</table>\n",
+        encoding="utf-8",
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--quick", action="store_true", help="small frames, few scenes: minutes on two cores")
+    parser.add_argument("--oidn", metavar="PYTHON", default=sys.executable, help="a Python that has a pyoidn")
+    parser.add_argument("--threads", type=int, default=0, help="of Mitsuba; 0: one a core")
+    args = parser.parse_args()
+    extent = QUICK if args.quick else FULL
+    out, table = args.out.resolve(), args.out.resolve() / "table.csv"
+    mi = start_mitsuba(args.threads or available_cores())
+    renderer = Renderer(mi, extent.size)
+    rows = results.read(table) if table.exists() else []
+    jobs = [(name, kind) for name in (*extent.scenes, SHOT) for kind in extent.filters]
+    for count, (name, kind) in enumerate(jobs, 1):
+        print(f"{count} of {len(jobs)}: {name}, {kind} filter", file=sys.stderr, flush=True)
+        folder = out / name / kind
+        render(renderer, extent, folder, name, kind)
+        for spp in extent.spp:
+            done = {tuple(row[key] for key in KEYS) for row in rows}
+            for row in measure(folder, name, spp, done, (name, kind, spp), args.oidn):
+                rows.append(row)
+                results.write(table, rows)
+    write_pages(out, rows)
+    for row in rows:
+        print("  ".join(f"{row[key]}" for key in (*KEYS, "psnr", "relmse", "flip", "flicker", "seconds") if key in row))
+    print(out / "index.html")
+
+
+if __name__ == "__main__":
+    main()

@@ -124,7 +124,7 @@ def test_files_that_are_no_models_are_named(tmp_path, bilinear_models):
         Session(tmp_path / "bare.onnx")
     with pytest.raises(InputError, match="no model 'nothing': neither a file nor one of"):
         find_model(4, "nothing")
-    with pytest.raises(InputError, match="there is no model for x3; the scales are x2, x4, x8"):
+    with pytest.raises(InputError, match="there is no model for x3; the scales are x1, x2, x4, x8"):
         find_model(3)
 
 

@@ -22,7 +22,7 @@ from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
-from tests.conftest import downsample, picture, read_bits, rgb, write_exr
+from tests.conftest import HEADER_ONLY, downsample, picture, read_bits, rgb, write_exr
 from tests.programs import leave_temporary
 from tests.shots import HEIGHT, WIDTH, layers, low_layers
 
@@ -303,7 +303,8 @@ def test_writing_holds_no_more_than_is_planned_for(tmp_path, layout, largest, ho
     hr = write_exr(tmp_path / "hr.exr", parts, compression=OpenEXR.NO_COMPRESSION)
     command = [sys.executable, "-c", WRITE, str(hr), str(tmp_path / "out.exr"), layout, str(largest)]
     held, grown = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
-    assert grown < (held if holds else 0) + 64, (held, grown)
+    times = 1 if HEADER_ONLY or layout != "multilayer" else 2  # OpenEXR 3.3 decodes the render for its header, too
+    assert grown < times * (held if holds else 0) + 64, (held, grown)
     assert (held > 100) == holds
 
 

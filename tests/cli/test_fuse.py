@@ -97,7 +97,7 @@ def test_what_the_renders_bring_back_can_be_seen_and_left_out(files):
     assert 0 <= json.loads(done.stdout)["trust"] <= 1
     done = fuse(*pair, "--trust", "off", "--json", "--overwrite")
     assert json.loads(done.stdout)["trust"] is None
-    assert open_exr(files / "out.exr").parts[0].attributes["msspl/trust"] == "off"
+    assert open_exr(files / "out.exr").parts[0].metadata["msspl/trust"] == "off"
     refused = fuse(*pair, "--trust", "maybe", "--overwrite")
     assert refused.returncode == 2 and "--trust 'maybe': use on or off" in refused.stderr
 

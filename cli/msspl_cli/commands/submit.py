@@ -35,7 +35,7 @@ JOB = "Job"
 #: that are about this command.
 _TAKEN = {
     *("renders", "output", "frames", "model", "quality", "map_file", "device", "view", "skip_existing"),
-    *("debug", "help_all"),
+    *("debug", "help_all", "version"),
 }
 #: Parameters of msspl-fuse that a job can't have: a task skips existing frames and reports to the farm.
 _LEFT_OUT = {"overwrite", "report_file", "progress", "as_json", "scheduler"}

@@ -23,6 +23,8 @@ from oiio_msspl.image.filters import blurred, box_downsample, interpolate
 #: shift. If it explains this fraction of the difference that tone curve and blur leave, a little better is enough. In
 #: a large picture noise explains less, and the second number is enough, in pixels.
 MIN_EXPLAINED, MIN_EXPLAINED_PIXELS = 0.2, 3000
+#: It also counts if it explains this fraction: smooth pictures have no fine structure that could fit better.
+OBVIOUS = 0.5
 #: A difference must be this many standard errors from none.
 CERTAIN = 8.0
 #: The frame is cut into this many parts along each side. Each part is left out once to estimate standard errors.
@@ -70,7 +72,8 @@ def find_framing(low: Array, high: Array) -> Framing:
     fit = max(fits, key=lambda fit: fit.explained)
     after = fine_fits(_move(low, fit.estimate / (1, 1, max(low.shape) / 2)), high)
     explains = fit.explained >= min(MIN_EXPLAINED, MIN_EXPLAINED_PIXELS / low.size)
-    if not fits_better(before, after, certain=not explains):
+    obvious = fit.explained >= OBVIOUS and fits_at_all(after)
+    if not obvious and not fits_better(before, after, certain=not explains):
         return Framing(judged=fits_at_all(before))
     x, y, at_edge = np.where(np.abs(fit.estimate) > CERTAIN * fit.error, fit.estimate, 0)
     return Framing(float(x), float(y), float(at_edge / (max(low.shape) / 2)), float(at_edge), judged=True)

@@ -227,7 +227,7 @@ def _looks_alike(judgement: Judgement, low: Array, high: Array, framing: Framing
         judgement.not_judged.append("whether both show the same thing")
     elif correlation < NO_PAIR:
         raise InputError(f"the two renders have nothing in common ({said}); give two of the same frame and camera")
-    elif correlation < ALIKE * expected:
+    elif correlation < ALIKE * expected and not (framing.x or framing.y or framing.zoom):
         judgement.warnings.append(f"the two renders hardly look alike ({said}): are they the same frame and camera?")
         return False
     return True

@@ -24,7 +24,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.motion import MotionField, user_fields
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.exr.render import ReadableRender, Render
 from oiio_msspl.fusion.motion.camera import Projection, camera_vectors, find_projection
 from oiio_msspl.fusion.motion.flow import flow_vectors, has_optical_flow
 from oiio_msspl.fusion.motion.formats import FEWEST, MARGIN, FieldCheck, check_field, is_silent
@@ -150,7 +150,8 @@ class MotionSource:
         frames, moves = (frame, neighbour), self.kind != STATIC
         names = [name for name in (ALBEDO, NORMAL) if all(has_guide(f.hr, name, moves=moves) for f in frames)]
         here, there = (f.pixels or f.hr for f in frames)
-        return here, there, names
+        averaged = [render for render in (here, there) if isinstance(render, Render)]
+        return here, there, [name for name in names if all(name in render.layers for render in averaged)]
 
     def tells_more(self, hr: MappedRender) -> bool:
         """Return whether something moves in a frame along an axis that is :attr:`silent`.

@@ -71,6 +71,8 @@ class TileFeatures:
     """All pixels of the HRLS's beauty are broken, so it is filled from the LRHS."""
     failed: tuple[Mask, Mask] | None = None
     """LRHS pixels (h, w) in buckets that failed, of the LRHS and of the HRLS; None if there are none."""
+    borrowed: Mask | None = None
+    """LRHS pixels (h, w) in which one render has the light of the other one; None if there are none."""
 
 
 def read_tile(
@@ -118,6 +120,7 @@ def read_tile(
         if failed is not None:
             lost_below |= failed[0]
         low[RGB] = np.where(lost_below[..., None], means, low[RGB])
+    borrowed = lost_below | lost.reshape(len(lost_below), scale, -1, scale).any(axis=(1, 3))
     return TileFeatures(
         lrhs=low,
         hrls=hrls,
@@ -129,6 +132,7 @@ def read_tile(
         inside=tile.area.intersect(alignment.grid).slices(tile.area),
         hrls_is_lost=bool(lost.all()),
         failed=failed,
+        borrowed=borrowed if borrowed.any() else None,
     )
 
 

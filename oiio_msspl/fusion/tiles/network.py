@@ -15,11 +15,11 @@ from oiio_msspl.aovs.features import ALBEDO, RGB
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.alpha import fuse_alpha
-from oiio_msspl.fusion.tiles.guards import LAYER_REACH, black_in_both, check_finite
+from oiio_msspl.fusion.tiles.guards import LAYER_REACH, black_in_both, check_finite, repeated
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile
 from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
-from oiio_msspl.image.filters import enlarged
+from oiio_msspl.image.filters import box_downsample, enlarged
 from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.model.render_mean import Images, Shares
@@ -134,8 +134,14 @@ def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shar
     if result.trust is None or tile.noise_free or RGB not in shares:
         return fused
     assert tile.lrhs is not None and tile.hrls is not None
-    renders = Renders(tile.lrhs[RGB], tile.hrls[RGB], shares[RGB], result.exposure)
+    lrhs, borrowed = tile.lrhs[RGB], tile.features.borrowed
+    if borrowed is not None:
+        lrhs = np.where(borrowed[..., None], box_downsample(fused, result.alignment.scale), lrhs)
+    renders = Renders(lrhs, tile.hrls[RGB], shares[RGB], result.exposure)
     picture, trust = trust_renders(fused, renders, reach)
+    if borrowed is not None:  # there, the renders are not independent
+        trust[borrowed] = 0
+        picture = np.where(repeated(borrowed[..., None], renders.scale), fused, picture)
     (rows, columns), area = tile.features.core, tile.features.lrhs_area
     core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
     result.trust[core.slices(result.alignment.grid)] = trust[rows, columns]

@@ -39,6 +39,8 @@ POINT, DOUBT = 0.1, 4.0
 MOSTLY = 0.6
 #: Noise counts this many times where a pixel is judged by itself.
 PIXEL = 4.0
+#: Largest exposed radiance that is weighed.
+BRIGHTEST = np.float32(1e6)
 #: Error of a half float, relative to its value.
 ROUNDING = 2.0**-12
 #: Reach of the windows of the light's correction, in pixels of each level, and its largest factor.
@@ -79,20 +81,28 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     Returns:
         The picture (s*h, s*w, c), >= 0, and how much of the HRLS's difference was put back, (h, w) in [0, 1].
     """
-    picture, low, high = (planes_of(image) for image in (fused, renders.lrhs, renders.hrls))
-    means = np.stack([box_downsample(plane, renders.scale) for plane in high])
+    picture, render = (planes_of(image) for image in (fused, renders.hrls))
     if renders.scale == 1:
-        high = high + np.float32(renders.share) * (low - high)
-    picture = np.stack(
-        [
-            _with_right_light(plane, lrhs, mean, renders, reach)
-            for plane, lrhs, mean in zip(picture, low, means, strict=True)
-        ]
+        render = render + np.float32(renders.share) * (planes_of(renders.lrhs) - render)
+    # Evidence is weighed in exposed units, in which squares neither overflow nor vanish.
+    lrhs, hrls = (_exposed(planes_of(image), renders.exposure) for image in (renders.lrhs, renders.hrls))
+    means = np.stack([box_downsample(plane, renders.scale) for plane in hrls])
+    exposed = _exposed(picture, renders.exposure)
+    factors = [_light_factor(*planes, renders, reach) for planes in zip(exposed, lrhs, means, strict=True)]
+    picture, exposed = (
+        np.stack([_multiplied(*planes) for planes in zip(image, factors, strict=True)]) for image in (picture, exposed)
     )
-    trust, points = _trust_in_detail(picture, low, high, means, renders, reach)
-    for plane, detailed in zip(picture, high, strict=True):
-        _blend(plane, detailed, trust, points)
+    detailed = hrls if renders.scale > 1 else _exposed(render, renders.exposure)
+    trust, points = _trust_in_detail(exposed, lrhs, detailed, means, renders, reach)
+    for plane, pixels in zip(picture, render, strict=True):
+        _blend(plane, pixels, trust, points)
     return np.moveaxis(picture, 0, -1), trust
+
+
+def _exposed(planes: Array, exposure: float) -> Array:
+    """Return radiance times the exposure, at most ``BRIGHTEST``."""
+    with np.errstate(over="ignore"):
+        return np.minimum(planes * np.float32(exposure), BRIGHTEST)
 
 
 def _trust_in_detail(
@@ -103,12 +113,12 @@ def _trust_in_detail(
     The second result is the part of it that is judged pixel by pixel.
 
     Args:
-        fused, lrhs, detailed: planes (c, h, w) or (c, s*h, s*w).
+        fused, lrhs, detailed: planes (c, h, w) or (c, s*h, s*w), exposed.
         means: those of the HRLS over LRHS pixels.
         renders, reach: as in :func:`trust_renders`.
     """
     scale = renders.scale
-    brightness = _brightness(box_downsample(fused.mean(axis=0), scale), renders.exposure)
+    brightness = _brightness(box_downsample(fused.mean(axis=0), scale))
     weight = np.divide(np.float32(1 / len(fused)), np.square(brightness), dtype=np.float32)
     differences = detailed - fused
     energy: Array = weight * box_downsample(np.square(differences).sum(axis=0), scale)
@@ -184,9 +194,9 @@ def _kept(energy: Array, noise: Array) -> Array:
     return np.clip((energy - noise) / np.maximum(energy, np.float32(1e-12)), 0, 1)
 
 
-def _brightness(mean: Array, exposure: float) -> Array:
+def _brightness(mean: Array) -> Array:
     """Return the local brightness (h, w) of a picture at the LRHS's resolution."""
-    return blurred(mean, 2) + np.float32(DARKEST / exposure)
+    return blurred(mean, 2) + np.float32(DARKEST)
 
 
 def _squared_noise(lrhs: Array, mean: Array) -> Array:
@@ -210,15 +220,14 @@ def _blend(picture: Array, render: Array, trust: Array, points: Array) -> None:
     for_row_blocks(work, len(render), render.shape[1], multiple=scale)
 
 
-def _with_right_light(picture: Array, lrhs: Array, mean: Array, renders: Renders, reach: int) -> Array:
-    """Return a picture (s*h, s*w) with the light of both renders where they agree that it differs.
+def _light_factor(picture: Array, lrhs: Array, mean: Array, renders: Renders, reach: int) -> Array:
+    """Return the factor (h, w) that gives a picture (s*h, s*w) the light of both renders where they agree on it.
 
     The differences of the renders to the picture are divided into levels of resolution, and each is shrunk by its own
     evidence: the light of large areas is known best. The picture is multiplied, so its detail stays.
     """
-    scale = renders.scale
-    own = box_downsample(picture, scale)
-    brightness = _brightness(own, renders.exposure)
+    own = box_downsample(picture, renders.scale)
+    brightness = _brightness(own)
     low, high = (lrhs - own) / brightness, (mean - own) / brightness
     lamps = np.minimum(low, high) > LAMP
     low[lamps] = high[lamps] = 0
@@ -226,8 +235,12 @@ def _with_right_light(picture: Array, lrhs: Array, mean: Array, renders: Renders
     while LIGHT_REACH * 2 ** (levels + 1) <= reach:
         levels += 1
     change = brightness * _agreed(low, high, np.float32(renders.share), levels) / np.maximum(own, 0.01 * brightness)
-    factor = np.clip(1 + change, 1 / LARGEST_FACTOR, LARGEST_FACTOR).astype(np.float32)
+    return np.clip(1 + change, 1 / LARGEST_FACTOR, LARGEST_FACTOR).astype(np.float32)
 
+
+def _multiplied(picture: Array, factor: Array) -> Array:
+    """Return a picture (s*h, s*w) times a factor (h, w), which is interpolated."""
+    scale = len(picture) // len(factor)
     result = np.empty_like(picture)
 
     def work(rows: slice) -> None:

@@ -81,52 +81,59 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     Returns:
         The picture (s*h, s*w, c), >= 0, and how much of the HRLS's difference was put back, (h, w) in [0, 1].
     """
-    picture, render = (planes_of(image) for image in (fused, renders.hrls))
-    if renders.scale == 1:
-        render = render + np.float32(renders.share) * (planes_of(renders.lrhs) - render)
-    # Evidence is weighed in exposed units, in which squares neither overflow nor vanish.
-    lrhs, hrls = (_exposed(planes_of(image), renders.exposure) for image in (renders.lrhs, renders.hrls))
-    means = np.stack([box_downsample(plane, renders.scale) for plane in hrls])
-    exposed = _exposed(picture, renders.exposure)
-    factors = [_light_factor(*planes, renders, reach) for planes in zip(exposed, lrhs, means, strict=True)]
-    picture, exposed = (
-        np.stack([_multiplied(*planes) for planes in zip(image, factors, strict=True)]) for image in (picture, exposed)
+    scale, exposure = renders.scale, np.float32(renders.exposure)
+    picture, render, low = (planes_of(image) for image in (fused, renders.hrls, renders.lrhs))
+    # Evidence is weighed at the LRHS's resolution, in exposed units, in which squares neither overflow nor vanish.
+    lrhs, means, own = (
+        [_exposed(box_downsample(plane, factor), exposure) for plane in planes]
+        for planes, factor in ((low, 1), (render, scale), (picture, scale))
     )
-    detailed = hrls if renders.scale > 1 else _exposed(render, renders.exposure)
-    trust, points = _trust_in_detail(exposed, lrhs, detailed, means, renders, reach)
+    if scale == 1:
+        render = render + np.float32(renders.share) * (low - render)
+    factors = [_light_factor(*planes, renders.share, reach) for planes in zip(own, lrhs, means, strict=True)]
+    picture = np.stack([_multiplied(*planes) for planes in zip(picture, factors, strict=True)])
+    energy, darker, brightness = _difference(picture, render, scale, exposure)
+    # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of
+    # the mean of both renders is E d^2 share (1 - share).
+    variance = np.float32(renders.share * (scale**2 if scale > 1 else 1 - renders.share))
+    noise = variance * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
+    relative = len(picture) * np.square(brightness)
+    trust, points = _trust_in_detail(energy / relative, noise / relative, darker, scale, reach)
     for plane, pixels in zip(picture, render, strict=True):
         _blend(plane, pixels, trust, points)
     return np.moveaxis(picture, 0, -1), trust
 
 
-def _exposed(planes: Array, exposure: float) -> Array:
-    """Return radiance times the exposure, at most ``BRIGHTEST``."""
+def _exposed(plane: Array, exposure: np.float32) -> Array:
+    """Return radiance times the exposure, limited to ``BRIGHTEST``."""
     with np.errstate(over="ignore"):
-        return np.minimum(planes * np.float32(exposure), BRIGHTEST)
+        return np.clip(plane * exposure, -BRIGHTEST, BRIGHTEST)
 
 
-def _trust_in_detail(
-    fused: Array, lrhs: Array, detailed: Array, means: Array, renders: Renders, reach: int
-) -> tuple[Array, Array]:
-    """Return how much of the difference between a render and the fused picture is detail, (h, w) in [0, 1].
+def _difference(picture: Array, render: Array, scale: int, exposure: np.float32) -> tuple[Array, Mask, Array]:
+    """Compare planes (c, s*h, s*w) at the LRHS's resolution, in exposed units.
 
-    The second result is the part of it that is judged pixel by pixel.
+    Returns:
+        The sum of the squared differences, where the render is darker, and the brightness of the picture, (h, w).
+    """
+    shape = len(picture[0]) // scale, picture.shape[2] // scale
+    energy, excess, mean = (np.zeros(shape, np.float32) for _ in range(3))
+    for plane, pixels in zip(picture, render, strict=True):
+        difference = _exposed(pixels - plane, exposure)
+        excess += box_downsample(difference, scale)
+        energy += box_downsample(np.square(difference, out=difference), scale)
+        mean += _exposed(box_downsample(plane, scale), exposure) / np.float32(len(picture))
+    return energy, excess < 0, _brightness(mean)
+
+
+def _trust_in_detail(energy: Array, noise: Array, darker: Mask, scale: int, reach: int) -> tuple[Array, Array]:
+    """Return how much of a difference is detail, (h, w) in [0, 1], and the part that is judged pixel by pixel.
 
     Args:
-        fused, lrhs, detailed: planes (c, h, w) or (c, s*h, s*w), exposed.
-        means: those of the HRLS over LRHS pixels.
-        renders, reach: as in :func:`trust_renders`.
+        energy, noise: squared difference relative to the brightness, and the part of it that noise explains.
+        darker: the renders are darker than the picture.
+        scale, reach: as in :func:`trust_renders`.
     """
-    scale = renders.scale
-    brightness = _brightness(box_downsample(fused.mean(axis=0), scale))
-    weight = np.divide(np.float32(1 / len(fused)), np.square(brightness), dtype=np.float32)
-    differences = detailed - fused
-    energy: Array = weight * box_downsample(np.square(differences).sum(axis=0), scale)
-    darker = box_downsample(differences.sum(axis=0), scale) < 0
-    # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of
-    # the mean of both renders is E d^2 share (1 - share).
-    factor = np.float32(renders.share * (scale**2 if scale > 1 else 1 - renders.share))
-    noise: Array = factor * weight * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
     windows = [(size, certain) for size, certain in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
     most = np.float32(LARGEST * scale**2)
     areas = _trust_in_areas(energy, noise, darker, most, windows)
@@ -220,13 +227,12 @@ def _blend(picture: Array, render: Array, trust: Array, points: Array) -> None:
     for_row_blocks(work, len(render), render.shape[1], multiple=scale)
 
 
-def _light_factor(picture: Array, lrhs: Array, mean: Array, renders: Renders, reach: int) -> Array:
-    """Return the factor (h, w) that gives a picture (s*h, s*w) the light of both renders where they agree on it.
+def _light_factor(own: Array, lrhs: Array, mean: Array, share: float, reach: int) -> Array:
+    """Return the factor (h, w) that gives a picture the light of both renders where they agree that it differs.
 
-    The differences of the renders to the picture are divided into levels of resolution, and each is shrunk by its own
-    evidence: the light of large areas is known best. The picture is multiplied, so its detail stays.
+    The differences of the renders to the picture's ``own`` means are divided into levels of resolution, and each is
+    shrunk by its own evidence: the light of large areas is known best. The picture is multiplied, so its detail stays.
     """
-    own = box_downsample(picture, renders.scale)
     brightness = _brightness(own)
     low, high = (lrhs - own) / brightness, (mean - own) / brightness
     lamps = np.minimum(low, high) > LAMP
@@ -234,7 +240,7 @@ def _light_factor(picture: Array, lrhs: Array, mean: Array, renders: Renders, re
     levels = 1
     while LIGHT_REACH * 2 ** (levels + 1) <= reach:
         levels += 1
-    change = brightness * _agreed(low, high, np.float32(renders.share), levels) / np.maximum(own, 0.01 * brightness)
+    change = brightness * _agreed(low, high, np.float32(share), levels) / np.maximum(own, 0.01 * brightness)
     return np.clip(1 + change, 1 / LARGEST_FACTOR, LARGEST_FACTOR).astype(np.float32)
 
 

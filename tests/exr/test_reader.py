@@ -133,6 +133,7 @@ def test_a_long_error_is_cut():
     assert reason_of(Source()) == f"channel {'x' * 192}..."
 
 
+@pytest.mark.skipif(not HEADER_ONLY, reason="OpenEXR 3.3 can't read all of them")
 @needs_shared("exr")
 @pytest.mark.parametrize("path", sorted(SHARED.glob("exr/**/*.exr")), ids=lambda p: f"{p.parent.name}/{p.stem}")
 def test_real_headers_are_read(path):

@@ -155,27 +155,21 @@ def in_squares(whole: Mask, partly: Mask, side: int, fraction: float) -> Mask:
 
 def max_3x3(values: Array) -> Array:
     """Return the largest of the 3 x 3 values around each pixel, (h, w, ...)."""
-    largest = values.copy(order="K")
-    for axis in (0, 1):  # a 3 x 3 maximum is one of three rows and one of three columns
-        lines = largest.swapaxes(0, axis)
-        before = lines.copy(order="K")
-        np.maximum(lines[1:], before[:-1], out=lines[1:])
-        np.maximum(lines[:-1], before[1:], out=lines[:-1])
-    return largest
+    return max_around(values, 1)
 
 
-def max_around(plane: Array, reach: int) -> Array:
-    """Return the largest value up to ``reach`` rows and columns away from each pixel, (h, w)."""
+def max_around(values: Array, reach: int) -> Array:
+    """Return the largest value up to ``reach`` rows and columns away from each pixel, (h, w, ...)."""
     for axis in (0, 1):
         distance, left = 1, reach
         while left > 0:  # windows that overlap double their reach with each maximum
             step = min(distance, left)
-            lines = plane.swapaxes(0, axis)
-            largest = lines.copy()
+            lines = values.swapaxes(0, axis)
+            largest = lines.copy(order="K")
             np.maximum(largest[step:], lines[:-step], out=largest[step:])
             np.maximum(largest[:-step], lines[step:], out=largest[:-step])
-            plane, left, distance = largest.swapaxes(0, axis), left - step, 2 * distance
-    return plane
+            values, left, distance = largest.swapaxes(0, axis), left - step, 2 * distance
+    return values
 
 
 def sum_3x3(values: Array) -> Array:

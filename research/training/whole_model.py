@@ -221,9 +221,9 @@ def save(models: Mapping[Path, onnx.ModelProto], family: str = "") -> None:
     for mode in DENOISERS:
         group = [model for model in models.values() if _contract(model).denoiser == mode]
         if group:
-            share_weights(group, folder / f"{denoiser_file(mode)}.weights", DENOISER)
+            _share_weights(group, folder / f"{denoiser_file(mode)}.weights", DENOISER)
     if family:
-        share_weights(list(models.values()), folder / f"{family}.weights", NETWORK)
+        _share_weights(list(models.values()), folder / f"{family}.weights", NETWORK)
     for path, model in models.items():
         onnx.save(model, path)
 
@@ -232,8 +232,8 @@ def _contract(model: onnx.ModelProto) -> Contract:
     return Contract.from_json(next(item.value for item in model.metadata_props if item.key == METADATA_KEY), "model")
 
 
-def share_weights(models: Sequence[onnx.ModelProto], file: Path, prefix: str = "") -> None:
-    """Move weights that are in the models and whose names begin with ``prefix`` into one file, equal ones once."""
+def _share_weights(models: Sequence[onnx.ModelProto], file: Path, prefix: str) -> None:
+    """Move weights whose names begin with ``prefix`` into one file, equal ones once."""
     places: dict[bytes, int] = {}
     with file.open("wb") as out:
         for model in models:

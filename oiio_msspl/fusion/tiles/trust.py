@@ -21,9 +21,11 @@ from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import blurred, box_downsample, max_around, means_around, upsample_linear
 from oiio_msspl.image.parallel import for_row_blocks
 
-#: Reach of the windows in which energies are compared, in LRHS pixels, and the t that leaves no doubt. Large windows
-#: find faint detail, small ones find where it ends. They hold fewer pixels, but also fewer kinds of noise.
-WINDOWS = ((3, 5.0), (7, 5.0), (15, 5.0))
+#: Reach of the windows in which energies are compared, in LRHS pixels. Large windows find faint detail, small ones find
+#: where it ends. They hold fewer pixels, but also fewer kinds of noise.
+WINDOWS = (3, 7, 15)
+#: The t up to which a difference is taken for noise, and the one that leaves no doubt.
+DOUBTFUL, CERTAIN = np.float32(3), np.float32(5)
 #: Exposed radiance that is added to the local brightness, so that dark noise does not count as much as light.
 DARKEST = 0.02
 #: Squared difference relative to the local brightness, and to s^2, that counts at most: a firefly is one pixel.
@@ -134,34 +136,31 @@ def _trust_in_detail(energy: Array, noise: Array, darker: Mask, scale: int, reac
         darker: the renders are darker than the picture.
         scale, reach: as in :func:`trust_renders`.
     """
-    windows = [(size, certain) for size, certain in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
+    sizes = [size for size in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
     most = np.float32(LARGEST * scale**2)
-    areas = _trust_in_areas(energy, noise, darker, most, windows)
-    points = _trust_in_points(energy, noise, darker, most, windows[-1][0])
+    areas = _trust_in_areas(energy, noise, darker, most, sizes)
+    points = _trust_in_points(energy, noise, darker, most, sizes[-1])
     return np.maximum(areas, points), points
 
 
-def _trust_in_areas(
-    energy: Array, noise: Array, darker: Mask, most: np.float32, windows: Sequence[tuple[int, float]]
-) -> Array:
+def _trust_in_areas(energy: Array, noise: Array, darker: Mask, most: np.float32, sizes: Sequence[int]) -> Array:
     """Return how much of a difference is detail by the means of windows, (h, w) in [0, 1].
 
     Args:
         energy, noise: squared difference, and the part of it that noise explains.
         darker: the renders are darker than the picture.
         most: values are limited to this.
-        windows: see ``WINDOWS``.
+        sizes: reaches of the windows.
     """
-    sizes = [size for size, _ in windows]
     # Most windows lack rare light, and the noise that it makes. So a window that is darker has the noise of all around.
     noise_around = means_around(noise, sizes[-1:])[0]
     energy, noise = np.minimum(energy, most), np.minimum(noise, most)
     energies, noises, squares = (means_around(x, sizes) for x in (energy, noise, np.square(energy) + np.square(noise)))
     trust = np.zeros_like(energy)
-    for i, (share, window) in enumerate(zip(means_around(darker.astype(np.float32), sizes), windows, strict=True)):
+    for i, (share, size) in enumerate(zip(means_around(darker.astype(np.float32), sizes), sizes, strict=True)):
         explained = np.where(share > MOSTLY, np.maximum(noises[i], noise_around), noises[i])
-        part = _certainty(energies[i] - explained, squares[i], *window) * _kept(energies[i], explained)
-        np.maximum(trust, means_around(part, [window[0]])[0], out=trust)
+        part = _certainty(energies[i] - explained, squares[i], size) * _kept(energies[i], explained)
+        np.maximum(trust, means_around(part, [size])[0], out=trust)
     return trust
 
 
@@ -183,8 +182,8 @@ def _trust_in_points(energy: Array, noise: Array, darker: Mask, most: np.float32
     return is_point * np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
 
 
-def _certainty(excess: Array, squares: Array, size: int, certain: float) -> Array:
-    """Return how certain it is that the mean of a window exceeds 0: from 0 at ``certain`` - 2 to 1 at ``certain``.
+def _certainty(excess: Array, squares: Array, size: int) -> Array:
+    """Return how certain it is that the mean of a window exceeds 0: 0 up to ``DOUBTFUL``, 1 from ``CERTAIN`` on.
 
     Args:
         excess: the mean.
@@ -193,7 +192,7 @@ def _certainty(excess: Array, squares: Array, size: int, certain: float) -> Arra
     """
     error = np.sqrt(np.maximum(squares, 0) / np.float32((2 * size + 1) ** 2))
     t = excess / np.maximum(error, np.float32(1e-12))
-    return np.clip((t - np.float32(certain - 2)) / np.float32(2), 0, 1)
+    return np.clip((t - DOUBTFUL) / (CERTAIN - DOUBTFUL), 0, 1)
 
 
 def _kept(energy: Array, noise: Array) -> Array:
@@ -277,7 +276,7 @@ def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:
     common, squares, energy = (means_around(plane, near)[0] for plane in (product, product * product, mean * mean))
     # Most windows lack rare light.
     squares = np.where(mean < 0, np.maximum(squares, squares_around), squares)
-    shrink = _certainty(common, squares, LIGHT_REACH, WINDOWS[-1][1]) * _kept(energy, energy - common)
+    shrink = _certainty(common, squares, LIGHT_REACH) * _kept(energy, energy - common)
     return mean * means_around(shrink, near)[0] + coarser
 
 

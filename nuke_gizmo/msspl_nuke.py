@@ -11,6 +11,7 @@ import contextlib
 import os
 import re
 import tempfile
+import textwrap
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -248,20 +249,15 @@ def _path(node: nuke.Node, knob: str) -> str:
 
 
 def _watch(job: _Job) -> None:
+    title = f"{job.name}: {os.path.basename(job.out.path)}"
     try:
-        outcome = run(job.commands, job.environment, _window(job))
-    except Exception as error:  # kept as text: the exception would keep the window
+        # Nuke closes the window when nothing refers to the task any more, so it is in no variable here.
+        outcome = run(job.commands, job.environment, nuke.ProgressTask(title))
+    except Exception as error:  # kept as text, because it refers to the task
         outcome = Outcome(error=str(error) if isinstance(error, FuseError) else f"unexpected {error!r}")
     finally:
         _running.discard(job.name)
     nuke.executeInMainThread(_finish, args=(job, outcome))
-
-
-def _window(job: _Job) -> nuke.ProgressTask:
-    """Open a progress window. Nuke closes it when nothing refers to the task any more."""
-    task = nuke.ProgressTask(job.name)
-    task.setMessage(f"{'submitting' if job.on_farm else 'fusing'} {os.path.basename(job.out.path)}")
-    return task
 
 
 # ---------------------------------------------------------------------------------- show the result, in the main thread
@@ -276,8 +272,9 @@ def _finish(job: _Job, outcome: Outcome) -> None:
         return
     frames = ", ".join(f"{number} {status}" for status, number in outcome.counts.items())
     said = [frames or ("done" if outcome.finished else "not done"), *dict.fromkeys(outcome.notes)]
+    lines = [textwrap.fill(text, 90) for text in said] + [outcome.last] * job.on_farm
     with _undo_step(job.name):
-        job.node["found"].setValue("\n".join(said + [outcome.last] * job.on_farm))
+        job.node["found"].setValue("\n".join(lines))
         if outcome.written or (outcome.finished and not job.on_farm):
             _load(job, node_name, outcome.written)
     if outcome.error:

@@ -93,7 +93,7 @@ def run(commands: Sequence[list[str]], environment: Mapping[str, str], window: A
             break
     if code:
         bad = outcome.counts["failed"] + outcome.counts["missing"]
-        more = f" ({bad - 1} more frames failed)" if bad > 1 else ""
+        more = f" ({bad - 1} more failed)" if bad > 1 else ""
         outcome.error = (outcome.error or outcome.last or f"{command[0]} ended with exit code {code}") + more
     outcome.finished = not code
     return outcome

@@ -82,7 +82,7 @@ def test_a_range_may_have_holes_at_its_ends(host, tmp_path):
     assert names(tmp_path) == ["hr_fused.1002.exr"]
     (message,) = host.messages
     assert message.startswith("MSSPLFuse1: frame 1001: no HRLS ")
-    assert message.endswith("(1 more frames failed)")
+    assert message.endswith("(1 more failed)")
     assert host.gizmo["found"].value().startswith("2 missing, 1 fused")
     assert [results(host)[0][k].value() for k in ("first", "last")] == [1002, 1002]
 

@@ -54,7 +54,7 @@ def test_a_failure_is_told_once_in_the_programs_own_words():
         return outcome.error
 
     bad = "".join(frame(n, n, "failed", "no") for n in (1, 2, 3))
-    assert error("print('error: frame 1: no');" + bad + "exit(2)") == "frame 1: no (2 more frames failed)"
+    assert error("print('error: frame 1: no');" + bad + "exit(2)") == "frame 1: no (2 more failed)"
     assert error("print('ended strangely'); exit(3)") == "ended strangely"
     assert error("exit(3)").endswith("ended with exit code 3")
     with pytest.raises(FuseError, match=r"^/nowhere: can't be started"):

@@ -58,6 +58,20 @@ def test_two_renders_of_one_size_are_fused(host, tmp_path):
     assert open_exr(tmp_path / "b_fused.1001.exr").metadata["msspl/model"] == "joint-x1"
 
 
+def test_two_renders_that_do_not_fit_are_told_in_one_sentence(host, tmp_path):
+    for name, seed, size in (("a", 1, 64), ("b", 1, 64), ("c", 2, 192)):
+        pixels = np.random.default_rng(seed).gamma(4, 0.25, (size, size, 3)).astype(np.float32)
+        write_exr(tmp_path / f"{name}.exr", rgb(pixels))
+    host.reads[0]["file"].setValue(str(tmp_path / "a.exr"))
+    for other, sentence in (("b", "have the same noise; render each with"), ("c", "a ratio of 3 is not supported")):
+        host.reads[1]["file"].setValue(str(tmp_path / f"{other}.exr"))
+        fuse(host, "fuse_frame")
+        (message,) = host.messages
+        host.messages.clear()
+        assert sentence in message and "\n" not in message
+    assert results(host) == []
+
+
 @pytest.mark.parametrize(
     ("knobs", "model"), [({"quality": "fast"}, "joint-small-x4"), ({"model": "paper"}, "paper-x4")]
 )

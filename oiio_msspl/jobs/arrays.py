@@ -7,12 +7,11 @@ import functools
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Render
-from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array
+from oiio_msspl.jobs.settings import family_for_noise
 from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, load_model
-from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.session import Session
 
 
@@ -29,7 +28,7 @@ def fuse_arrays(
 ) -> FusedFrame:
     """Remove the noise of a render, or of two renders of the same frame together.
 
-    The model is one for renders of these sizes, and for noise that a pixel filter has spread if it has.
+    The model is one for renders of these sizes, and for their noise.
 
     Args:
         hr: (height, width, 3), scene linear.
@@ -55,8 +54,7 @@ def fuse_arrays(
     low = high if lr is None else Render.from_arrays("lr", rgb=lr)
     alignment = align(low, high)
     family = QUALITIES[quality if aovs else min(quality, DEFAULT_QUALITY, key=list(QUALITIES).index)]
-    if is_noise_spread(low, high, alignment):
-        family += SPREAD
+    family, _ = family_for_noise(family, low, high, alignment)
     return fuse(low, high, _session(alignment.scale, family, device, threads))
 
 

@@ -10,16 +10,30 @@ from dataclasses import dataclass, field
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.checks.noise_level import has_little_noise
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.neighbours.renders import RenderPair
-from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.jobs.inputs import InputOptions
-from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of, for_spread_noise, load_model
-from oiio_msspl.model.contract import SPREAD
+from oiio_msspl.model.catalogue import (
+    DEFAULT_QUALITY,
+    QUALITIES,
+    family_of,
+    for_little_noise,
+    for_spread_noise,
+    load_model,
+)
+from oiio_msspl.model.contract import CLEAN, ONE_SIZE, SPREAD
 from oiio_msspl.model.session import Session
 
+#: What notes say of noise, by the ending of the family that suits it.
+NOISE = {
+    SPREAD: "the pixel filter has spread the noise over neighbouring pixels",
+    CLEAN: "there is little noise",
+}
 #: Bytes above which a size is a slip. Larger numbers are infinite as floats.
 LARGEST_MEMORY = 1 << 62
 
@@ -94,8 +108,8 @@ def choose_model(
     """Return the model to use, and whether the pair has noise that decides it: a black frame has none.
 
     For a quality, ``auto`` and None, the model is a family that suits the pair. ``best`` gains nothing without an
-    albedo and a normal, and the default quality replaces it. Noise that the pixel filter has spread needs the family
-    that was trained for it. Notes of the HRLS say so, and if a model that is named does not suit the noise.
+    albedo and a normal, and the default quality replaces it. Then :func:`family_for_noise` decides. Notes of the HRLS
+    say so, and if a model that is named does not suit the noise.
 
     Args:
         lr, hr: the pair.
@@ -105,31 +119,46 @@ def choose_model(
     Raises:
         InputError: the pair does not fit together.
     """
+    alignment = align(lr, hr)
 
-    def is_spread() -> bool | None:
+    def renders() -> tuple[ReadableRender, ReadableRender]:
         pair = RenderPair(lr, hr) if read is None else read()
-        return is_noise_spread(pair.lr, pair.hr, align(lr, hr))
+        return pair.lr, pair.hr
 
     family = family_of(model)
     if family is None:
         assert model is not None
         suited = for_spread_noise(model)
-        spread = suited is not None and is_spread()
+        spread = suited is not None and is_noise_spread(*renders(), alignment)
         if spread:
-            hr.notes.append(
-                f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise; use "
-                f"--model {suited}"
-            )
+            hr.notes.append(f"{NOISE[SPREAD]}, and {model} leaves such noise; use --model {suited}")
         return model, spread is not None
     suited = family_for_layers(hr, family)
     if suited != family:
         family = suited
         hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
-    spread = is_spread()
-    if not spread:
-        return family, spread is not None
-    hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")
-    return family + SPREAD, True
+    family, noise = family_for_noise(family, *renders(), alignment)
+    if noise:
+        hr.notes.append(f"{NOISE[noise]}, so the model is {family}")
+    return family, noise is not None
+
+
+def family_for_noise(
+    family: str, lr: ReadableRender, hr: ReadableRender, alignment: Alignment
+) -> tuple[str, str | None]:
+    """Return the counterpart of a family that suits the noise of a pair, and the kind of noise.
+
+    It is a key of ``NOISE``; "" for noise that needs no counterpart, and None without noise. Noise that the pixel
+    filter has spread needs weights of its own. In renders of one size with little noise, the denoiser of their mean
+    alone is more accurate.
+    """
+    spread = is_noise_spread(lr, hr, alignment)
+    if spread:
+        return family + SPREAD, SPREAD
+    clean = for_little_noise(family) if alignment.scale == ONE_SIZE else None
+    if clean and has_little_noise(lr, hr, alignment):
+        return clean, CLEAN
+    return family, None if spread is None else ""
 
 
 def family_for_layers(hr: MappedRender, family: str) -> str:

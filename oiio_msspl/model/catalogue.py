@@ -7,7 +7,7 @@ import csv
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.model.contract import ONE_SIZE, SCALES, SPREAD
+from oiio_msspl.model.contract import CLEAN, ONE_SIZE, SCALES, SPREAD
 from oiio_msspl.model.session import Session
 
 #: Folder of the models: ``NAME.onnx`` for each.
@@ -55,6 +55,11 @@ def for_spread_noise(name: str) -> str | None:
     return family + SPREAD if any(model.startswith(f"{family}{SPREAD}-x") for model in models) else None
 
 
+def for_little_noise(family: str) -> str | None:
+    """Return the counterpart of a family for renders of one size with little noise; None if there is none."""
+    return family + CLEAN if f"{family}{CLEAN}-x{ONE_SIZE}" in shipped_models() else None
+
+
 def find_model(scale: int, name: str | None = None) -> Path:
     """Return the ONNX file of a model.
 
@@ -90,7 +95,8 @@ def model_files(scale: int, name: str | None = None) -> list[Path]:
     another one fuses passes at half of the frame's resolution.
     """
     path = find_model(scale, name)
-    endings = {WEIGHTS / f"{QUALITIES['best']}{ending}-x{scale}.onnx": ending for ending in ("", SPREAD)}
+    fast_endings = {"": "", SPREAD: SPREAD, CLEAN: ""}
+    endings = {WEIGHTS / f"{QUALITIES['best']}{ending}-x{scale}.onnx": fast for ending, fast in fast_endings.items()}
     if path not in endings:
         return [path]
     half = [WEIGHTS / f"{MEAN_MODEL}{endings[path]}-x1.onnx"] if scale == 2 else []

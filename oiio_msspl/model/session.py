@@ -15,7 +15,7 @@ import numpy as np
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.image.parallel import check_threads
-from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.contract import CLEAN, Contract
 from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
 from oiio_msspl.model.digests import digests
 from oiio_msspl.model.encoding import default_value
@@ -102,7 +102,8 @@ class Session:
     def require_error(self) -> None:
         """Raise InputError if the model does not predict its error."""
         if "log_error" not in self._outputs:
-            raise InputError(f"model {self.name} does not predict its error; choose another --model")
+            other = f"use --model {self.name.replace(CLEAN, '')}" if CLEAN in self.name else "choose another --model"
+            raise InputError(f"model {self.name} does not predict its error; {other}")
 
     @property
     def clean_aovs(self) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ def error(path):
 
 def test_one_file_and_two_of_one_size(tmp_path):
     """Two are better than one. Other layers are those of the last one."""
-    a, b, out = write_render(tmp_path / "a.exr", 1), write_render(tmp_path / "b.exr", 2), tmp_path / "out.exr"
+    a, b, out = write_render(tmp_path / "a.exr", 1, 1), write_render(tmp_path / "b.exr", 2, 1), tmp_path / "out.exr"
     one = fuse_files(None, b, out, model="best").as_dict()
     assert (one["scale"], one["model"], one["lrhs"], one["hrls"]) == (1, "joint-large-x1", None, str(b))
     assert one["lrhs_aovs"] == {} and one["warnings"] == []
@@ -65,6 +65,26 @@ def test_spread_noise_of_one_render_is_noticed(tmp_path):
     render = write_render(tmp_path / "hr.exr", 1, sigma=0.5)
     report = fuse_files(None, render, tmp_path / "out.exr", model="fast")
     assert report.model == "joint-small-spread-x1"
+
+
+@pytest.mark.parametrize("quality", ["balanced", "best"])
+def test_renders_with_little_noise_have_a_model_of_their_own(tmp_path, quality):
+    """It is better there. It predicts no error, which is said with the model that does."""
+    a, b, out = (tmp_path / f"{name}.exr" for name in ("a", "b", "out"))
+    for seed, path in enumerate((a, b)):
+        write_render(path, seed, 256)
+    families = {"balanced": "joint", "best": "joint-large"}
+    for first in (None, a):
+        report = fuse_files(first, b, out, model=quality, overwrite=True)
+        assert report.model == f"{families[quality]}-clean-x1"
+        assert any("little noise" in note for note in report.hr.notes)
+        own = error(out)
+        fuse_files(first, b, out, model=f"{families[quality]}-x1", overwrite=True)
+        assert own < error(out)
+    with pytest.raises(InputError, match=f"use --model {families[quality]}-x1"):
+        fuse_files(None, b, out, model=quality, write=WriteOptions(error_layer=True), overwrite=True)
+    fuse_files(None, write_render(tmp_path / "noisy.exr", 2, 1), out, model=quality, overwrite=True)
+    assert f"{families[quality]}-x1" in open_exr(out).metadata["msspl/model"]
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,8 @@ from oiio_msspl.model.contract import ONE_SIZE
 
 #: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``.
 SCORES = {
+    "joint-clean-x1": (22.73, 0.0296),
+    "joint-large-clean-x1": (24.38, 0.0243),
     "joint-large-spread-x1": (23.99, 0.0276),
     "joint-large-spread-x2": (24.56, 0.0255),
     "joint-large-spread-x4": (24.23, 0.0273),

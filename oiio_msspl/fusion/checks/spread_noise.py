@@ -53,7 +53,7 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
     """
     scale, correlations = alignment.scale, []
     with hr.cache_strips(CACHE_BYTES):
-        for window in _samples(alignment.grid):
+        for window in sample_windows(alignment.grid):
             low = read_lrhs(lr, alignment, window, [RGB])[RGB]
             area = in_hrls_pixels(window, scale)
             high = read_features(hr, area, alignment.hr_data_window, [RGB])[RGB]
@@ -73,7 +73,7 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
     return bool(np.median(hrls) > SPREAD_HRLS and np.median(difference) > SPREAD_DIFFERENCE)
 
 
-def _samples(grid: Window) -> list[Window]:
+def sample_windows(grid: Window) -> list[Window]:
     """Return different squares of at most ``SAMPLE`` pixels, evenly spread over the grid."""
 
     width, height = min(SAMPLE, grid.width), min(SAMPLE, grid.height)

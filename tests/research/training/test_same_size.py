@@ -9,18 +9,20 @@ pytest.importorskip("torch")
 import onnx
 
 from oiio_msspl.model.catalogue import QUALITIES, WEIGHTS
-from oiio_msspl.model.contract import ONE_SIZE, SPREAD, Contract
+from oiio_msspl.model.contract import CLEAN, ONE_SIZE, SPREAD, Contract
 from oiio_msspl.model.devices import gpu_file
 from oiio_msspl.model.session import Session
 from research.training.same_size import same_size_model
 
 FAMILIES = [family + noise for family in QUALITIES.values() for noise in ("", SPREAD)]
+CLEAN_FAMILIES = [QUALITIES[quality] + CLEAN for quality in ("balanced", "best")]
 
 
-@pytest.mark.parametrize("family", [QUALITIES["fast"] + SPREAD, QUALITIES["best"]])
+@pytest.mark.parametrize("family", [QUALITIES["fast"] + SPREAD, QUALITIES["best"], *CLEAN_FAMILIES])
 def test_the_files_are_those_that_are_made_from_the_model_for_pairs(family):
-    for path in (WEIGHTS / f"{family}-x2.onnx", gpu_file(WEIGHTS / f"{family}-x2.onnx")):
-        shipped, made = onnx.load(path.with_name(f"{family}-x1.onnx")), same_size_model(path)
+    pairs = WEIGHTS / f"{family.removesuffix(CLEAN)}-x2.onnx"
+    for path in (pairs, gpu_file(pairs)):
+        shipped, made = onnx.load(path.with_name(f"{family}-x1.onnx")), same_size_model(path, family.endswith(CLEAN))
         onnx.load_external_data_for_model(made, str(path.parent))
         assert list(shipped.graph.node) == list(made.graph.node)
         assert _constants(shipped) == _constants(made)
@@ -31,7 +33,7 @@ def _constants(model):
     return {tensor.name: onnx.numpy_helper.to_array(tensor).tobytes() for tensor in model.graph.initializer}
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", [*FAMILIES, *CLEAN_FAMILIES])
 def test_two_renders_are_denoised_together(family):
     """Their mean, and better than one of them, which is given as both with shares of 0."""
     rng = np.random.default_rng(0)

@@ -57,13 +57,15 @@ def find_render(preference: str = "") -> str:
 
 
 def fuse(
-    program: str, work: Path, overwrite: bool, threads: int, lrhs: str, hrls: str, output: str
+    program: str, options: Sequence[str], work: Path, renders: Sequence[str], before: float, output: str
 ) -> Generator[Progress, None, dict[str, Any]]:
-    """Fuse two files.
+    """Fuse one render or two.
 
     Args:
         program: of :func:`find_fuse`.
+        options: of msspl-fuse.
         work: a folder for temporary files.
+        before: the progress before it.
 
     Returns:
         The report of msspl-fuse.
@@ -72,13 +74,12 @@ def fuse(
         Failure: msspl-fuse failed. The message is its own.
     """
     # Blender's Image node shows all passes of a single-part file only.
-    command = [program, lrhs, hrls, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
-    command += ["--overwrite"] if overwrite else []
-    command += ["--threads", str(threads)] if threads else []
+    command = [program, *renders, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
+    command += options
 
     def progress(log: Path) -> Progress:
         steps = _STEP.findall(_read(log))
-        return "fuse", (2 + (int(steps[-1][0]) / int(steps[-1][1]) if steps else 0)) / 3
+        return "fuse", before + (1 - before) * (int(steps[-1][0]) / int(steps[-1][1]) if steps else 0)
 
     return (yield from _run("msspl-fuse", command, work, progress))
 
@@ -104,10 +105,11 @@ def render_shot(
     command = [program, bpy.data.filepath, "-o", pattern, "--frames", frames, "--json"]
     command += ["--blender", bpy.app.binary_path or sys.executable]
     command += ["--scene-name", scene.name, "--view-layer", options.view_layer]
-    command += ["--scale", str(options.scale), "--hr-spp", str(options.hr_spp), "--filter", options.filter.lower()]
-    command += ["--lr-spp", str(options.lr_spp)] if options.lr_spp else []
+    command += ["--renders", str(options.renders), "--scale", str(options.scale), "--filter", options.filter.lower()]
+    command += ["--hr-spp", str(options.hrls_spp)]
+    command += ["--lr-spp", str(options.lr_spp)] if options.lr_spp and options.scale > 1 else []
     command += ["--components"] if options.components else []
-    command += ["--threads", str(options.threads)] if options.threads else []
+    command += model_options(scene)
     command += ["--temporal", "auto" if scene.msspl.average else "off"]
     command += ["--overwrite" if overwrite else "--skip-existing"]
     files = list(outputs.values())
@@ -120,6 +122,11 @@ def render_shot(
         return f"{done} of {len(files)} frames", done / len(files)
 
     return (yield from _run("msspl-render", command, work, progress))
+
+
+def model_options(scene: Scene) -> list[str]:
+    """Return the options of both programs that choose the model and the device on which it runs."""
+    return ["--quality", scene.msspl.quality.lower(), "--device", scene.msspl.device.lower()]
 
 
 def _run(
@@ -151,7 +158,10 @@ def _run(
         lines = _read(log).strip().splitlines() or [f"the program ended with code {process.returncode}"]
         said = next((line for line in lines if line.startswith("error: ")), lines[-1])
         raise Failure(f"{name}: {said.removeprefix('error: ')}", 2 if process.returncode == 2 else 1)
-    return json.loads(_read(report))
+    try:
+        return json.loads(_read(report))
+    except ValueError as error:
+        raise Failure(f"{command[0]}: printed no report; check that it is {name}, of the add-on's version") from error
 
 
 def _written(path: str) -> int | None:

@@ -66,14 +66,14 @@ def layer(path, name, components):
 
 def test_the_composited_frame_equals_the_fused_file(results):
     for name, components in (("Combined", "RGBA"), ("Mist", "ZZZ"), ("Normal", "XYZ")):
-        fused = layer(results / "fused_012.exr", f"ViewLayer.{name}.", components)
+        fused = layer(results / "fused_ViewLayer_012.exr", f"ViewLayer.{name}.", components)
         composited = layer(results / f"composited_{name}.exr", "", "RGBA"[: len(components)])
         np.testing.assert_array_equal(composited, fused)
         assert fused.std() > 0.01
 
 
 def test_each_frame_of_the_composited_animation_equals_its_fused_file(results):
-    fused = layer(results / "shot_13.exr", "ViewLayer.Combined.", "RGBA")
+    fused = layer(results / "ViewLayer_13.exr", "ViewLayer.Combined.", "RGBA")
     np.testing.assert_array_equal(layer(results / "composited_shot.exr", "", "RGBA"), fused)
     assert fused.std() > 0.01
 
@@ -90,10 +90,10 @@ def test_frames_have_the_linear_space_of_the_output_and_the_compositor_converts_
 
 
 def test_the_animation_button_renders_what_averaging_needs(results):
-    names = [channel.name for part in open_exr(results / "shot_12.exr").parts for channel in part.channels]
+    names = [channel.name for part in open_exr(results / "ViewLayer_12.exr").parts for channel in part.channels]
     assert "ViewLayer.Vector.X" in names
     assert "ViewLayer.Vector.X" not in [
-        c.name for part in open_exr(results / "fused_012.exr").parts for c in part.channels
+        c.name for part in open_exr(results / "fused_ViewLayer_012.exr").parts for c in part.channels
     ]
 
 

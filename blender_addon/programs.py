@@ -37,7 +37,7 @@ def find_fuse(preference: str = "") -> str:
     for where, name in (("the add-on's preferences", preference), ("MSSPL_FUSE", variable), ("", "msspl-fuse")):
         program = shutil.which(os.path.expanduser(name)) if name else None
         if program is not None:
-            return program
+            return os.path.abspath(program)
         if name and where:
             raise Failure(f"{name}: no such program; correct the path in {where}")
     raise Failure("msspl-fuse is not on PATH; give its path in the add-on's preferences or in the variable MSSPL_FUSE")
@@ -73,8 +73,9 @@ def fuse(
     Raises:
         Failure: msspl-fuse failed. The message is its own.
     """
-    # Blender's Image node shows all passes of a single-part file only.
-    command = [program, *renders, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
+    # Blender's Image node shows all passes of a single-part file only. The result names its renders, whose folder goes.
+    names = [os.path.relpath(render, work) for render in renders]
+    command = [program, *names, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
     command += options
 
     def progress(log: Path) -> Progress:
@@ -132,7 +133,7 @@ def model_options(scene: Scene) -> list[str]:
 def _run(
     name: str, command: Sequence[str], work: Path, progress: Callable[[Path], Progress]
 ) -> Generator[Progress, None, Any]:
-    """Run a program and return the JSON that it prints. ``progress`` gets the file of its messages."""
+    """Run a program in a folder and return the JSON that it prints. ``progress`` gets the file of its messages."""
     # The program runs in another Python, which must not get the variables of Blender's.
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     environment["PYTHONUTF8"] = "1"  # Paths and messages are in UTF-8 on every platform.
@@ -141,6 +142,7 @@ def _run(
         try:
             process = subprocess.Popen(
                 command,
+                cwd=work,
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,

@@ -117,34 +117,37 @@ def _run_frame(
 def _compare(
     scene: Scene, options: Options, job: dict[str, Any], reports: Sequence[dict[str, Any]], send: Send
 ) -> None:
-    """Render the frames that are written in the ordinary way with OIDN, each in the mean time of all frames.
+    """Render the frames that are written in the ordinary way with OIDN, with as many samples as the mean frame allows.
 
-    A single frame does not tell its time, because it may be fused together with frames that waited for it.
+    The time of a single frame does not tell, because it may be fused together with frames that waited for it. The first
+    frame tells the samples, and all frames get as many.
     """
     seconds, samples = (fmean(report[key] for report in reports) for key in ("seconds", "plain_spp"))
+    most = 3
     for number, output in job["frames"]:
         if output is None:
             continue
         if number is not None:
             scene.frame_set(number)
-        oidn = _render_plain(scene, options, job, seconds, samples, send)
+        oidn = _render_plain(scene, options, job, seconds, samples, most, send)
+        samples, most = oidn["spp"], 1
         beside = Path(output).with_name(f"{Path(output).stem}_oidn.exr")
         os.replace(oidn["file"], beside)
         send(frame=scene.frame_current, oidn=oidn | {"file": str(beside)})
 
 
 def _render_plain(
-    scene: Scene, options: Options, job: dict[str, Any], seconds: float, samples: float, send: Send
+    scene: Scene, options: Options, job: dict[str, Any], seconds: float, samples: float, most: int, send: Send
 ) -> dict[str, Any]:
     """Render the frame the ordinary way with OIDN, in a given time, with about so many samples per pixel.
 
-    Render times cannot be predicted well. So each of at most three attempts sets the spp of the next one from its own
-    time, and the closest attempt is kept.
+    Render times cannot be predicted well. So each of at most ``most`` attempts sets the spp of the next one from its
+    own time, and the closest attempt is kept.
     """
     attempts: dict[int, dict[str, Any]] = {}
     # The time of a single frame includes loading the scene. In a shot, all frames share the scene that is loaded.
     loading = {"render.use_persistent_data": len(job["frames"]) > 1}
-    while len(attempts) < 3 and (spp := max(1, round(samples))) not in attempts:
+    while len(attempts) < most and (spp := max(1, round(samples))) not in attempts:
         send(frame=scene.frame_current, step=f"ordinary render with OIDN, {spp} spp", fraction=1.0)
         start = time.perf_counter()
         file = Path(job["work"], f"oidn{spp}.exr")

@@ -93,6 +93,7 @@ def check_loaded_once(scene):
         plain = len({(event["frame"], event["step"]) for event in events if "ordinary" in event.get("step", "")})
         assert loaded == (loads if len(numbers) > 1 else 1 + plain), (loaded, plain)
         assert [event["frame"] for event in oidn] == list(numbers)
+        assert len({event["oidn"]["spp"] for event in oidn}) == 1
         seconds = [event["report"]["seconds"] for event in events if "report" in event]
         targets = [event["report"]["plain_spp"] for event in events if "report" in event]
         first = next(event["step"] for event in events if "ordinary" in event.get("step", ""))

@@ -4,6 +4,7 @@
 import os
 import time
 from collections.abc import Callable, Generator, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from statistics import fmean
@@ -109,7 +110,9 @@ def _run_frame(
         return {"warnings": []}  # msspl-render has its own, and may not have written this frame yet
 
     on_step("start", 0.0)
-    steps = render_and_fuse(scene, options, Path(output or work / "none.exr"), work, fuse, job["overwrite"])
+    steps = render_and_fuse(
+        scene, options, Path(output or work / "none.exr"), work, fuse, nullcontext(), overwrite=job["overwrite"]
+    )
     report = run_to_end(steps, on_step)
     return {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
 

@@ -7,7 +7,7 @@ However the job ends, the scene gets its own settings back.
 
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,13 +79,22 @@ class Report:
 
 
 def render_and_fuse(
-    scene: Scene, options: Options, output: Path, work: Path, fuse: Fuse, overwrite: bool = False, window: bool = False
+    scene: Scene,
+    options: Options,
+    output: Path,
+    work: Path,
+    fuse: Fuse,
+    loaded: AbstractContextManager[None],
+    *,
+    overwrite: bool = False,
+    window: bool = False,
 ) -> Generator[Progress, None, Report]:
     """Render and fuse a frame, and yield the progress.
 
     Args:
         output: the EXR to write.
         work: a folder for the renders, which stay there.
+        loaded: entered while frames are rendered: :func:`loaded_once`, or nothing if the caller is inside of it.
         window: let Blender go on while it renders. The caller must then return to Blender's event loop between steps.
 
     Returns:
@@ -99,19 +108,20 @@ def render_and_fuse(
     to_render = _input_renders(scene, options, work)
     identity, moment = (scene.name, scene.session_uid), (scene.frame_current, scene.frame_subframe)
     steps = len(to_render) + 1
-    for index, (part, values) in enumerate(to_render):
-        yield str(part), index / steps
-        scene = find_scene(*identity)
-        if (scene.frame_current, scene.frame_subframe) != moment:
-            raise Failure(
-                f"the scene went from frame {moment[0]} to {scene.frame_current} during the render; render again"
-            )
-        start = time.perf_counter()
-        with override(scene, values | {"render.filepath": escape_path(part.file)}):
-            check_animation(scene, values)
-            for _ in render(scene, part.file, window=window):
-                yield str(part), index / steps
-        part.seconds = time.perf_counter() - start
+    with loaded:
+        for index, (part, values) in enumerate(to_render):
+            yield str(part), index / steps
+            scene = find_scene(*identity)
+            if (scene.frame_current, scene.frame_subframe) != moment:
+                raise Failure(
+                    f"the scene went from frame {moment[0]} to {scene.frame_current} during the render; render again"
+                )
+            start = time.perf_counter()
+            with override(scene, values | {"render.filepath": escape_path(part.file)}):
+                check_animation(scene, values)
+                for _ in render(scene, part.file, window=window):
+                    yield str(part), index / steps
+            part.seconds = time.perf_counter() - start
     start, renders = time.perf_counter(), [part for part, _ in to_render]
     fused = yield from fuse([part.file for part in renders], (steps - 1) / steps, str(output))
     return Report(str(output), renders, time.perf_counter() - start, fused["warnings"])

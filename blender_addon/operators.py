@@ -116,7 +116,7 @@ class _Job:
 
 
 class MSSPL_OT_fuse(_Job, bpy.types.Operator):
-    """Render the frame at low and at full resolution, fuse the two renders, and show the result in the compositor"""
+    """Render the frame as Renders says, fuse the renders, and show the result in the compositor"""
 
     bl_idname = "msspl.fuse"
     bl_label = "Render and Fuse"
@@ -134,15 +134,15 @@ class MSSPL_OT_fuse(_Job, bpy.types.Operator):
             work, output = Path(name), Path(bpy.path.abspath(path))
             more = [*programs.model_options(scene), *(["--overwrite"] if overwrite else [])]
             fuse = functools.partial(programs.fuse, program, more, work)
-            with frame.loaded_once(scene):
-                job = frame.render_and_fuse(scene, options, output, work, fuse, overwrite=overwrite, window=window)
-                report = yield from job
+            loaded = frame.loaded_once(scene)
+            report = yield from frame.render_and_fuse(
+                scene, options, output, work, fuse, loaded, overwrite=overwrite, window=window
+            )
         self._finish(overrides.find_scene(*identity), options.view_layer, path, report.warnings, f"{path}: {report}")
 
 
 class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
-    """Render all frames of the scene at low and at full resolution, in another Blender, and fuse them. Show the result
-    in the compositor"""
+    """Render all frames of the scene in another Blender, fuse them, and show the result in the compositor"""
 
     bl_idname = "msspl.fuse_animation"
     bl_label = "Render and Fuse Animation"

@@ -42,7 +42,7 @@ class MSSPLSettings(bpy.types.PropertyGroup):
     )
     hr_spp: IntProperty(
         name="Samples",
-        description="Samples per pixel of each render of the frame's size. 0: 8 in all, or 1 besides a small render",
+        description="Samples per pixel of each render of the frame's size. 0: 8 in all, or 1 beside a small render",
         default=0,
         min=0,
     )

@@ -78,7 +78,7 @@ def check_changes(scene):
     options = module("options").Options(renders=2, scale=4, view_layer="ViewLayer")
 
     def said(scene, meanwhile):
-        steps = frame.render_and_fuse(scene, options, WORK / "new.exr", WORK, fuse=None)
+        steps = frame.render_and_fuse(scene, options, WORK / "new.exr", WORK, None, frame.loaded_once(scene))
         next(steps)
         meanwhile()
         try:

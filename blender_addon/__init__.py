@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender add-on: render a Cycles scene at low and at full resolution, fuse the two, and composite the result."""
+"""Blender add-on: render a Cycles scene once, twice or at two sizes, fuse the renders, and composite the result."""
 
 from . import operators, panel
 

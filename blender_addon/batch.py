@@ -3,9 +3,11 @@
 
 import os
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import bpy
@@ -14,7 +16,7 @@ from bpy.types import Scene
 from . import render_settings
 from .checks import check_animation, check_scene
 from .errors import Failure
-from .frame import Progress, Report, render_and_fuse, run_to_end
+from .frame import Progress, loaded_once, render_and_fuse, run_to_end
 from .options import Options, find_view_layer, hrls_size
 from .overrides import override
 from .render import escape_path, render
@@ -46,16 +48,20 @@ def run_job(job: dict[str, Any], send: Send, receive: Callable[[], None]) -> Non
     if options.vectors and scene.render.use_motion_blur:
         send(no_vectors="motion blur is on, and Cycles then writes no motion vectors; turn it off")
         options = replace(options, vectors=False)
-    for index, (number, output) in enumerate(job["frames"]):
-        if number is not None:
-            scene.frame_set(number)
-        if index == 0:
-            check_scene(scene, options)
-            send(size=hrls_size(scene), **_passes(scene, options))
-        if output is not None:
-            send(report=_run_frame(scene, options, job, Path(output), send, receive))
-        elif options.vectors:
-            _run_frame(scene, options, job, None, send, receive)
+    reports = []
+    with loaded_once(scene):
+        for index, (number, output) in enumerate(job["frames"]):
+            if number is not None:
+                scene.frame_set(number)
+            if index == 0:
+                check_scene(scene, options)
+                send(size=hrls_size(scene), **_passes(scene, options))
+            if output is not None or options.vectors:
+                reports.append(_run_frame(scene, options, job, output, send, receive))
+                if output is not None:
+                    send(report=reports[-1])
+        if job["compare"]:
+            _compare(scene, options, job, reports, send)
 
 
 def _open_scene(file: str, name: str) -> None:
@@ -87,7 +93,7 @@ def _passes(scene: Scene, options: Options) -> dict[str, Any]:
 
 
 def _run_frame(
-    scene: Scene, options: Options, job: dict[str, Any], output: Path | None, send: Send, receive: Callable[[], None]
+    scene: Scene, options: Options, job: dict[str, Any], output: str | None, send: Send, receive: Callable[[], None]
 ) -> dict[str, Any]:
     """Render a frame and have it fused. A frame without an output is rendered for its neighbours."""
     number = scene.frame_current
@@ -97,45 +103,64 @@ def _run_frame(
     def on_step(step: str, fraction: float) -> None:
         send(frame=number, step=step, fraction=fraction)
 
-    def fuse(lrhs: str, hrls: str, output: str) -> Generator[Progress, None, dict[str, Any]]:
-        yield "fuse", 2 / 3
-        send(fuse={"lrhs": lrhs, "hrls": hrls})  # msspl-render keeps its model loaded
+    def fuse(renders: Sequence[str], before: float, output: str) -> Generator[Progress, None, dict[str, Any]]:
+        yield "fuse", before
+        send(fuse=renders)  # msspl-render keeps its model loaded
         receive()
         return {"warnings": []}  # msspl-render has its own, and may not have written this frame yet
 
     on_step("start", 0.0)
-    steps = render_and_fuse(scene, options, output or work / "none.exr", work, fuse, job["overwrite"])
+    steps = render_and_fuse(
+        scene, options, Path(output or work / "none.exr"), work, fuse, nullcontext(), overwrite=job["overwrite"]
+    )
     report = run_to_end(steps, on_step)
-    result = {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
-    if job["compare"] and output:
-        beside = output.with_name(f"{output.stem}_oidn.exr")
-        result["oidn"] = _render_plain(scene, options, report, on_step, Path(job["work"]))
-        os.replace(result["oidn"]["file"], beside)
-        result["oidn"]["file"] = str(beside)
-    return result
+    return {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
+
+
+def _compare(
+    scene: Scene, options: Options, job: dict[str, Any], reports: Sequence[dict[str, Any]], send: Send
+) -> None:
+    """Render the frames that are written in the ordinary way with OIDN, with as many samples as the mean frame allows.
+
+    The time of a single frame does not tell, because it may be fused together with frames that waited for it. The first
+    frame tells the samples, and all frames get as many.
+    """
+    seconds, samples = (fmean(report[key] for report in reports) for key in ("seconds", "plain_spp"))
+    most = 3
+    for number, output in job["frames"]:
+        if output is None:
+            continue
+        if number is not None:
+            scene.frame_set(number)
+        oidn = _render_plain(scene, options, job, seconds, samples, most, send)
+        samples, most = oidn["spp"], 1
+        beside = Path(output).with_name(f"{Path(output).stem}_oidn.exr")
+        os.replace(oidn["file"], beside)
+        send(frame=scene.frame_current, oidn=oidn | {"file": str(beside)})
 
 
 def _render_plain(
-    scene: Scene, options: Options, report: Report, on_step: Callable[[str, float], None], work: Path
+    scene: Scene, options: Options, job: dict[str, Any], seconds: float, samples: float, most: int, send: Send
 ) -> dict[str, Any]:
-    """Render the frame the ordinary way with OIDN, in the time that the LRHS, the HRLS and the fusion took together.
+    """Render the frame the ordinary way with OIDN, in a given time, with about so many samples per pixel.
 
-    Render times cannot be predicted well. So each of at most three attempts sets the spp of the next one from its own
-    time, and the closest attempt is kept.
+    Render times cannot be predicted well. So each of at most ``most`` attempts sets the spp of the next one from its
+    own time, and the closest attempt is kept.
     """
     attempts: dict[int, dict[str, Any]] = {}
-    samples = report.plain_spp
-    while len(attempts) < 3 and (spp := max(1, round(samples))) not in attempts:
-        on_step(f"ordinary render with OIDN, {spp} spp", 1.0)
+    # The time of a single frame includes loading the scene. In a shot, all frames share the scene that is loaded.
+    loading = {"render.use_persistent_data": len(job["frames"]) > 1}
+    while len(attempts) < most and (spp := max(1, round(samples))) not in attempts:
+        send(frame=scene.frame_current, step=f"ordinary render with OIDN, {spp} spp", fraction=1.0)
         start = time.perf_counter()
-        file = work / f"oidn{spp}.exr"
-        values = render_settings.plain(scene, options, spp)
+        file = Path(job["work"], f"oidn{spp}.exr")
+        values = render_settings.plain(scene, options, spp) | loading
         with override(scene, values | {"render.filepath": escape_path(str(file))}):
             check_animation(scene, values)
             list(render(scene, str(file)))
         attempts[spp] = {"spp": spp, "seconds": time.perf_counter() - start, "file": str(file)}
-        ratio = report.seconds / attempts[spp]["seconds"]
+        ratio = seconds / attempts[spp]["seconds"]
         if 0.9 < ratio < 1.1:
             break
         samples = spp * ratio
-    return min(attempts.values(), key=lambda attempt: abs(attempt["seconds"] - report.seconds))
+    return min(attempts.values(), key=lambda attempt: abs(attempt["seconds"] - seconds))

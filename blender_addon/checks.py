@@ -16,7 +16,7 @@ def check_scene(scene: Scene, options: Options) -> None:
     """Check the scene before anything is rendered.
 
     Raises:
-        Failure: the scene cannot be rendered at two sizes, or the two renders could not be fused.
+        Failure: the scene cannot be rendered at these sizes, or its renders could not be fused.
     """
     render = scene.render
     if render.engine != "CYCLES":
@@ -28,13 +28,10 @@ def check_scene(scene: Scene, options: Options) -> None:
     if render.use_multiview:
         raise Failure(f"scene '{scene.name}' is stereoscopic; turn Stereoscopy off and render one view at a time")
     if render.use_freestyle:
-        raise Failure(
-            f"scene '{scene.name}' draws Freestyle lines, which have the same width in pixels at both sizes; "
-            "turn Freestyle off"
-        )
+        raise Failure(f"scene '{scene.name}' draws Freestyle lines, which are no noise to remove; turn Freestyle off")
     if min(lrhs_size(scene, options.scale)) < 4:  # Blender renders no smaller image.
         width, height = hrls_size(scene)
-        raise Failure(f"{width}x{height} is too small for x{options.scale}; use a smaller scale")
+        raise Failure(f"{width}x{height} is too small for x{options.scale}; use a smaller scale or a larger frame")
     find_view_layer(scene, options)
 
 
@@ -57,7 +54,8 @@ def check_animation(scene: Scene, values: dict[str, Any]) -> None:
     for path, value in wanted.items():
         other_layer = path.startswith("view_layers[") and not path.startswith(view_layer_path(rendered))
         if any(read(version, path) != value for version in ([scene] if other_layer else [scene, copy])):
-            raise Failure(f"scene '{scene.name}': {path} is animated; remove its keyframes or driver")
+            instead = ", and turn on Animate Seed, the clock beside it" if path == "cycles.seed" else ""
+            raise Failure(f"scene '{scene.name}': {path} is animated; remove its keyframes or driver{instead}")
 
 
 def check_output(path: Path, overwrite: bool) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shows fused frames in the scene's compositor, as an Image node."""
+"""Shows fused frames in the scene's compositor, as an Image node for each view layer."""
 
 from collections.abc import Sequence
 
@@ -9,12 +9,18 @@ from bpy.types import Node, NodeTree, Scene
 from .render_settings import BLENDER_5, linear_override
 
 NODE = "MSSPL Fused"
+#: The custom property of a node that names its view layer.
+_LAYER = "view_layer"
 
 
-def show(scene: Scene, path: str, connect: bool, frames: Sequence[int] | None = None) -> Node:
-    """Load a fused EXR into the node ``MSSPL Fused``, which is made if there is none. An old node keeps its links.
+def show(scene: Scene, view_layer: str, path: str, connect: bool, frames: Sequence[int] | None = None) -> Node:
+    """Load a fused EXR into the view layer's node ``MSSPL Fused``, which is made if there is none.
+
+    A node that exists keeps its links. Render Layers nodes that nothing reads are muted, because Blender would render
+    the scene again for them when it composites.
 
     Args:
+        view_layer: the name of the view layer of the file.
         path: may begin with ``//``, which stands for the folder of the .blend.
         connect: connect the node to the compositor's output even if another node is connected there.
         frames: numbers of the frames of an animation, whose first file ``path`` is. None: it is a single frame.
@@ -23,10 +29,12 @@ def show(scene: Scene, path: str, connect: bool, frames: Sequence[int] | None = 
         The node. Its outputs are the passes of the file.
     """
     tree, fresh = _tree(scene)
-    node = tree.nodes.get(NODE)
+    ours = [node for node in tree.nodes if node.name.startswith(NODE)]
+    node = next((node for node in ours if node.get(_LAYER, view_layer) == view_layer), None)
     if node is None:
         node = tree.nodes.new("CompositorNodeImage")
-        node.name = node.label = NODE
+        node.name, node.label = NODE, f"{NODE} {view_layer}"
+    node[_LAYER] = view_layer
     if node.image is None:
         node.image = bpy.data.images.load(path)
     else:
@@ -46,7 +54,10 @@ def show(scene: Scene, path: str, connect: bool, frames: Sequence[int] | None = 
     if connect or fresh or not output.inputs[0].is_linked:
         tree.links.new(node.outputs["Combined"], output.inputs[0])
     if tuple(node.location) == (0, 0):
-        node.location = output.location.x - 400, output.location.y + 300
+        node.location = output.location.x - 400, output.location.y + 300 * len([node, *ours])
+    for other in tree.nodes:
+        if other.bl_idname == "CompositorNodeRLayers" and not any(socket.is_linked for socket in other.outputs):
+            other.mute = True
     return node
 
 

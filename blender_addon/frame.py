@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes one frame: renders the LRHS, renders the HRLS, and fuses the two.
+"""Makes one frame: renders it once or twice, and fuses the renders.
 
 A job is a generator that yields its progress, so that a window stays responsive. Closing the generator cancels the job.
 However the job ends, the scene gets its own settings back.
 """
 
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,16 +23,17 @@ from .render import escape_path, render
 
 #: The current step, and the fraction of the work that is done.
 Progress = tuple[str, float]
-#: Fuses the files of an LRHS and of an HRLS into a third, and returns a dictionary with ``warnings``.
-Fuse = Callable[[str, str, str], Generator[Progress, None, dict[str, Any]]]
+#: Fuses the files of one or two renders into another one, and returns a dictionary with ``warnings``. The second
+#: argument is the progress before it.
+Fuse = Callable[[Sequence[str], float, str], Generator[Progress, None, dict[str, Any]]]
 
 
 @dataclass
 class InputRender:
-    """One of the two renders that are fused."""
+    """A render that is fused."""
 
     name: str
-    """``LRHS`` or ``HRLS``."""
+    """``LRHS`` and ``HRLS``; ``render``; or ``render 1`` and ``render 2``, which have the frame's size."""
     size: tuple[int, int]
     """(width, height) in pixels."""
     spp: int
@@ -53,39 +55,46 @@ class Report:
     """The files and times of one fused frame."""
 
     output: str
-    lrhs: InputRender
-    hrls: InputRender
+    renders: list[InputRender]
     fuse_seconds: float
     warnings: list[str]
 
     @property
     def seconds(self) -> float:
-        """The time of both renders and of the fusion."""
-        return self.lrhs.seconds + self.hrls.seconds + self.fuse_seconds
+        """The time of the renders and of the fusion."""
+        return sum(part.seconds for part in self.renders) + self.fuse_seconds
 
     @property
     def plain_spp(self) -> float:
-        """Estimated spp of an ordinary render that takes as long as this frame took: the samples of both renders and,
-        during the time of the fusion, samples at the rate of the faster render."""
-        rate = max(part.samples / max(part.seconds, 1e-3) for part in (self.lrhs, self.hrls))
-        samples = self.lrhs.samples + self.hrls.samples + rate * self.fuse_seconds
-        return samples / (self.hrls.size[0] * self.hrls.size[1])
+        """Estimated spp of an ordinary render that takes as long as this frame took: the samples of all renders and,
+        during the time of the fusion, samples at the rate of the fastest render."""
+        rate = max(part.samples / max(part.seconds, 1e-3) for part in self.renders)
+        samples = sum(part.samples for part in self.renders) + rate * self.fuse_seconds
+        return samples / (self.renders[-1].size[0] * self.renders[-1].size[1])
 
     def __str__(self) -> str:
-        return (
-            f"LRHS {self.lrhs.seconds:.1f} s, HRLS {self.hrls.seconds:.1f} s, fuse {self.fuse_seconds:.1f} s; "
-            f"an ordinary render takes about {self.plain_spp:.1f} spp in the same time"
-        )
+        times = "".join(f"{part.name} {part.seconds:.1f} s, " for part in self.renders)
+        same_time = f"an ordinary render takes about {self.plain_spp:.1f} spp in the same time"
+        return f"{times}fuse {self.fuse_seconds:.1f} s; {same_time}"
 
 
 def render_and_fuse(
-    scene: Scene, options: Options, output: Path, work: Path, fuse: Fuse, overwrite: bool = False, window: bool = False
+    scene: Scene,
+    options: Options,
+    output: Path,
+    work: Path,
+    fuse: Fuse,
+    loaded: AbstractContextManager[None],
+    *,
+    overwrite: bool = False,
+    window: bool = False,
 ) -> Generator[Progress, None, Report]:
     """Render and fuse a frame, and yield the progress.
 
     Args:
         output: the EXR to write.
-        work: a folder for ``lr.exr`` and ``hr.exr``, which stay there.
+        work: a folder for the renders, which stay there.
+        loaded: entered while frames are rendered: :func:`loaded_once`, or nothing if the caller is inside of it.
         window: let Blender go on while it renders. The caller must then return to Blender's event loop between steps.
 
     Returns:
@@ -96,32 +105,51 @@ def render_and_fuse(
     """
     check_output(output, overwrite)
     check_scene(scene, options)
-    lrhs = InputRender("LRHS", lrhs_size(scene, options.scale), options.lrhs_spp, str(Path(work, "lr.exr")))
-    hrls = InputRender("HRLS", hrls_size(scene), options.hr_spp, str(Path(work, "hr.exr")))
-    values = render_settings.lrhs(scene, options), render_settings.hrls(scene, options)
+    to_render = _input_renders(scene, options, work)
     identity, moment = (scene.name, scene.session_uid), (scene.frame_current, scene.frame_subframe)
-    # With persistent data, Blender loads the scene once for both renders. Turning it off first discards the data of
-    # earlier renders: Cycles does not notice that lights have another group since, and renders that group black.
-    with (
-        override(scene, {"render.use_persistent_data": False}),
-        override(scene, {"render.use_persistent_data": True}),
-    ):
-        for index, part in enumerate((lrhs, hrls)):
-            yield str(part), index / 3
+    steps = len(to_render) + 1
+    with loaded:
+        for index, (part, values) in enumerate(to_render):
+            yield str(part), index / steps
             scene = find_scene(*identity)
             if (scene.frame_current, scene.frame_subframe) != moment:
                 raise Failure(
                     f"the scene went from frame {moment[0]} to {scene.frame_current} during the render; render again"
                 )
             start = time.perf_counter()
-            with override(scene, values[index] | {"render.filepath": escape_path(part.file)}):
-                check_animation(scene, values[index])
+            with override(scene, values | {"render.filepath": escape_path(part.file)}):
+                check_animation(scene, values)
                 for _ in render(scene, part.file, window=window):
-                    yield str(part), index / 3
+                    yield str(part), index / steps
             part.seconds = time.perf_counter() - start
-    start = time.perf_counter()
-    fused = yield from fuse(lrhs.file, hrls.file, str(output))
-    return Report(str(output), lrhs, hrls, time.perf_counter() - start, fused["warnings"])
+    start, renders = time.perf_counter(), [part for part, _ in to_render]
+    fused = yield from fuse([part.file for part in renders], (steps - 1) / steps, str(output))
+    return Report(str(output), renders, time.perf_counter() - start, fused["warnings"])
+
+
+@contextmanager
+def loaded_once(scene: Scene) -> Iterator[None]:
+    """Keep the scene's data in memory for all renders of this block, also those of other frames.
+
+    Data of earlier renders are discarded first: Cycles does not notice that the user has put lights into another group
+    since, and renders that group black.
+    """
+    with (
+        override(scene, {"render.use_persistent_data": False}),
+        override(scene, {"render.use_persistent_data": True}),
+    ):
+        yield
+
+
+def _input_renders(scene: Scene, options: Options, work: Path) -> list[tuple[InputRender, dict[str, Any]]]:
+    """Return the renders that are fused, each with its settings."""
+    names = ["LRHS", "HRLS"] if options.scale > 1 else ["render 1", "render 2"] if options.renders > 1 else ["render"]
+    full = InputRender(names[-1], hrls_size(scene), options.hrls_spp, str(work / "hr.exr"))
+    inputs = [(full, render_settings.hrls(scene, options))]
+    if options.renders > 1:
+        first = InputRender(names[0], lrhs_size(scene, options.scale), options.lrhs_spp, str(work / "lr.exr"))
+        inputs.insert(0, (first, render_settings.lrhs(scene, options)))
+    return inputs
 
 
 def run_to_end(job: Generator[Progress, None, Report], on_step: Callable[[str, float], None]) -> Report:

@@ -13,14 +13,15 @@ The job is a JSON object:
     work       folder for temporary files, on the same file system as the results
     options    fields of :class:`.options.Options`
     overwrite  replace results that exist
-    compare    also write an ordinary render, denoised with OIDN, that takes the same time
+    compare    after the last frame, also write an ordinary render of each, denoised with OIDN, that takes as long as
+               the frames do in the mean
 
 Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON object. After the line
-``MSSPL {"fuse": {"lrhs": file, "hrls": file}}``, msspl-render fuses these files, and deletes them when no frame needs
-them any more. It then writes a line to standard input. A frame that it can't fuse ends the input.
+``MSSPL {"fuse": [file]}``, or two files, msspl-render fuses these renders, and deletes them when no frame needs them
+any more. It then writes a line to standard input. A frame that it can't fuse ends the input.
 
 Before the first frame is rendered comes ``MSSPL {"size": [width, height], "layers": names or null, "pixel_bytes":
-number}``: the size of the HRLS, its passes with colours, and the bytes of all its passes for each pixel (0 if they are
+number}``: the size of the frame, its passes with colours, and the bytes of all its passes for each pixel (0 if they are
 not known). If such a frame can't be fused, msspl-render ends this process.
 
 ``MSSPL {"no_vectors": reason}`` says that frames can't be averaged with their neighbours, ``MSSPL {"warning":

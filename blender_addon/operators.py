@@ -106,17 +106,17 @@ class _Job:
         return _CONTINUE
 
     def _finish(
-        self, scene: Scene, path: str, warnings: list[str], text: str, frames: Sequence[int] | None = None
+        self, scene: Scene, layer: str, path: str, warnings: list[str], text: str, frames: Sequence[int] | None = None
     ) -> None:
-        """Show the result in the compositor, and report it."""
-        compositor.show(scene, path, scene.msspl.connect, frames)
+        """Show the result of a view layer in the compositor, and report it."""
+        compositor.show(scene, layer, path, scene.msspl.connect, frames)
         for warning in dict.fromkeys(warnings):
             self.report({"WARNING"}, warning)
         self.report({"INFO"}, text)
 
 
 class MSSPL_OT_fuse(_Job, bpy.types.Operator):
-    """Render the frame at low and at full resolution, fuse the two renders, and show the result in the compositor"""
+    """Render the frame as Renders says, fuse the renders, and show the result in the compositor"""
 
     bl_idname = "msspl.fuse"
     bl_label = "Render and Fuse"
@@ -127,20 +127,22 @@ class MSSPL_OT_fuse(_Job, bpy.types.Operator):
         identity, overwrite = (scene.name, scene.session_uid), scene.render.use_overwrite
         program = programs.find_fuse(_preference(context))
         options = settings.options(context.view_layer.name)
-        path = _numbered(settings.output, scene.frame_current)
+        path = _numbered(_output(scene, options.view_layer), scene.frame_current)
         if path.startswith("//") and not bpy.data.filepath:
             raise Failure(f"{path}: save the .blend first, or give a full path")
         with tempfile.TemporaryDirectory(prefix="msspl-") as name:
             work, output = Path(name), Path(bpy.path.abspath(path))
-            fuse = functools.partial(programs.fuse, program, work, overwrite, options.threads)
-            job = frame.render_and_fuse(scene, options, output, work, fuse, overwrite=overwrite, window=window)
-            report = yield from job
-        self._finish(overrides.find_scene(*identity), path, report.warnings, f"{path}: {report}")
+            more = [*programs.model_options(scene), *(["--overwrite"] if overwrite else [])]
+            fuse = functools.partial(programs.fuse, program, more, work)
+            loaded = frame.loaded_once(scene)
+            report = yield from frame.render_and_fuse(
+                scene, options, output, work, fuse, loaded, overwrite=overwrite, window=window
+            )
+        self._finish(overrides.find_scene(*identity), options.view_layer, path, report.warnings, f"{path}: {report}")
 
 
 class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
-    """Render all frames of the scene at low and at full resolution, in another Blender, and fuse them. Show the result
-    in the compositor"""
+    """Render all frames of the scene in another Blender, fuse them, and show the result in the compositor"""
 
     bl_idname = "msspl.fuse_animation"
     bl_label = "Render and Fuse Animation"
@@ -155,7 +157,10 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
         # Without a window, Blender does not know whether a file has changed.
         if not file or (bpy.data.is_dirty and not bpy.app.background):
             raise Failure(f"{file or 'the scene'}: save the .blend first; another Blender renders the saved file")
-        pattern, frames = settings.output, range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        pattern, frames = (
+            _output(scene, options.view_layer),
+            range(scene.frame_start, scene.frame_end + 1, scene.frame_step),
+        )
         if not _LAST_NUMBER.search(pattern):
             raise Failure(f"{pattern}: name the frames with #### as the last number, such as //fused_####.exr")
         outputs = {number: bpy.path.abspath(_numbered(pattern, number)) for number in frames}
@@ -166,13 +171,42 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
         warnings = [warning for report in reports for warning in report["warnings"]]
         text = f"{pattern}: {len(reports)} of {len(frames)} frames rendered and fused"
         text += f" {reports[0]['temporal']}" if reports else ""
-        self._finish(overrides.find_scene(*identity), _numbered(pattern, frames[0]), warnings, text, frames)
+        shown = overrides.find_scene(*identity), options.view_layer, _numbered(pattern, frames[0])
+        self._finish(*shown, warnings, text, frames)
 
 
 #: The frame number in the name of a file. The name of a folder may contain #.
 _NUMBER = re.compile(r"#+(?=[^/\\]*$)")
+#: Characters of a scene's names that become _ in the name of a file.
+_NOT_IN_NAMES = re.compile(r'[#<>:"/\\|?*{}]')
 #: The last number of the name, which Blender's compositor takes for the frame number.
 _LAST_NUMBER = re.compile(r"(?<![\d#])#+[^/\\\d#]*$")
+
+
+def _output(scene: Scene, view_layer: str) -> str:
+    """Return the name of the output, with the names of the scene in the place of ``{scene_name}`` and so on.
+
+    Raises:
+        Failure: the name holds other braces, or would be that of several view layers.
+    """
+    pattern, several = scene.msspl.output, [layer.name for layer in scene.view_layers if layer.use]
+    if len(several) > 1 and "{view_layer}" not in pattern:
+        raise Failure(
+            f"{pattern}: {len(several)} view layers are on ({', '.join(several)}); put {{view_layer}} into the name, "
+            "so that each has a file of its own"
+        )
+    names = {
+        "view_layer": view_layer,
+        "scene_name": scene.name,
+        "camera_name": scene.camera.name if scene.camera else "no_camera",
+        "blend_name": bpy.path.display_name_from_filepath(bpy.data.filepath) or "Unsaved",
+    }
+    safe = {key: _NOT_IN_NAMES.sub("_", name) for key, name in names.items()}
+    try:
+        return pattern.format_map(safe)
+    except (AttributeError, LookupError, ValueError) as error:
+        known = ", ".join(f"{{{key}}}" for key in names)
+        raise Failure(f"{pattern}: write braces only around known names, which are {known}") from error
 
 
 def _numbered(pattern: str, number: int) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The options of a frame: scale, samples, view layer, and the two sizes that follow from the scene."""
+"""The options of a frame: renders, samples, view layer, and the sizes that follow from the scene."""
 
 from dataclasses import dataclass
 
@@ -13,9 +13,12 @@ from .errors import Failure
 class Options:
     """The options with which a frame is rendered and fused."""
 
-    scale: int = 4
-    """The LRHS has 1/scale of the frame's width and height."""
-    hr_spp: int = 1
+    renders: int = 1
+    """1; or 2, each with its own noise seed."""
+    scale: int = 1
+    """The first of two renders has 1/scale of the frame's width and height. If scale > 1, it is the LRHS."""
+    hr_spp: int = 0
+    """0: chosen by :attr:`hrls_spp`."""
     lr_spp: int = 0
     """0: chosen by :attr:`lrhs_spp`."""
     filter: str = "BOX"
@@ -30,10 +33,17 @@ class Options:
     """0: Blender uses the number that the scene sets, and fusing uses one thread per core."""
 
     @property
+    def hrls_spp(self) -> int:
+        """Samples per pixel of each render of the frame's size: by default 1 beside an LRHS, otherwise 8 in all."""
+        return self.hr_spp or (1 if self.scale > 1 else 8 // self.renders)
+
+    @property
     def lrhs_spp(self) -> int:
-        """Samples per pixel of the LRHS. By default it takes a third of the HRLS's total samples, rounded up, but at
-        least scale² per pixel, which is always more than the HRLS has."""
-        return self.lr_spp or -(-(self.scale**2) * max(3, self.hr_spp) // 3)
+        """Samples per pixel of the first of two renders. By default an LRHS takes a third of the HRLS's total samples,
+        rounded up, but at least scale² per pixel, which is always more than the HRLS has."""
+        if self.scale == 1:
+            return self.hrls_spp
+        return self.lr_spp or -(-(self.scale**2) * max(3, self.hrls_spp) // 3)
 
 
 def hrls_size(scene: Scene) -> tuple[int, int]:

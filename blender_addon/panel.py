@@ -25,6 +25,15 @@ status = Status()
 
 
 class MSSPLSettings(bpy.types.PropertyGroup):
+    renders: EnumProperty(
+        name="Renders",
+        description="What is rendered of each frame, and then fused",
+        items=[
+            ("ONE", "One", "One render of the frame"),
+            ("TWO", "Two Seeds", "Two renders of the frame's size, each with its own noise. What both show is detail"),
+            ("SIZES", "Two Sizes", "A small render with many samples, and one of the frame's size with few"),
+        ],
+    )
     scale: EnumProperty(
         name="Scale",
         description="The low-resolution render has 1/scale of the width and height of the frame",
@@ -32,10 +41,13 @@ class MSSPLSettings(bpy.types.PropertyGroup):
         default="4",
     )
     hr_spp: IntProperty(
-        name="HRLS Samples", description="Samples per pixel of the full-resolution render", default=1, min=1
+        name="Samples",
+        description="Samples per pixel of each render of the frame's size. 0: 8 in all, or 1 beside a small render",
+        default=0,
+        min=0,
     )
     lr_spp: IntProperty(
-        name="LRHS Samples",
+        name="Small Samples",
         description="Samples per pixel of the low-resolution render. 0: a third of the total samples of the "
         "full-resolution render, but at least scale x scale samples per pixel",
         default=0,
@@ -47,6 +59,21 @@ class MSSPLSettings(bpy.types.PropertyGroup):
             ("BOX", "Box", "A low-resolution pixel is the mean of its full-resolution pixels, as the network expects"),
             ("SCENE", "Scene", "The pixel filter of the scene"),
         ],
+    )
+    quality: EnumProperty(
+        name="Quality",
+        description="The model that fuses",
+        items=[
+            ("FAST", "Fast", "For previews"),
+            ("BALANCED", "Balanced", "For most frames"),
+            ("BEST", "Best", "For final frames that can wait"),
+        ],
+        default="BALANCED",
+    )
+    device: EnumProperty(
+        name="Device",
+        description="Where the model runs. Devices other than the CPU need a package of their own beside msspl-fuse",
+        items=[(name.upper(), name, "") for name in ("CPU", "CUDA", "TensorRT", "OpenVINO", "CoreML", "DirectML")],
     )
     components: BoolProperty(
         name="All Component Passes",
@@ -61,7 +88,8 @@ class MSSPLSettings(bpy.types.PropertyGroup):
     )
     output: StringProperty(
         name="Output",
-        description="The EXR to write. # stands for the frame number",
+        description="The EXR to write. # stands for the frame number, {view_layer}, {scene_name}, {camera_name} and "
+        "{blend_name} for the names of these",
         default="//fused_####.exr",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
@@ -73,7 +101,8 @@ class MSSPLSettings(bpy.types.PropertyGroup):
 
     def options(self, view_layer: str) -> Options:
         """Return the options of a frame of a view layer."""
-        return Options(int(self.scale), self.hr_spp, self.lr_spp, self.filter, view_layer, self.components)
+        renders, scale = 1 if self.renders == "ONE" else 2, int(self.scale) if self.renders == "SIZES" else 1
+        return Options(renders, scale, self.hr_spp, self.lr_spp, self.filter, view_layer, self.components)
 
 
 class MSSPLPreferences(bpy.types.AddonPreferences):
@@ -106,13 +135,15 @@ class MSSPL_PT_fuse(bpy.types.Panel):
         layout, scene = self.layout, context.scene
         settings = scene.msspl
         layout.use_property_split = True
-        for name in ("scale", "hr_spp", "lr_spp", "filter", "components", "average", "output", "connect"):
-            layout.prop(settings, name)
         options = settings.options("")
-        sizes = lrhs_size(scene, options.scale), hrls_size(scene)
-        layout.label(
-            text="{}x{} at {} spp, {}x{} at {} spp".format(*sizes[0], options.lrhs_spp, *sizes[1], options.hr_spp)
-        )
+        small = ("scale", "lr_spp") if options.scale > 1 else ()
+        choices = ("quality", "device", "filter", "components", "average", "output", "connect")
+        for name in ("renders", *small, "hr_spp", *choices):
+            layout.prop(settings, name)
+        inputs = [(hrls_size(scene), options.hrls_spp)]
+        if options.renders > 1:
+            inputs.insert(0, (lrhs_size(scene, options.scale), options.lrhs_spp))
+        layout.label(text=", ".join(f"{width}x{height} at {spp} spp" for (width, height), spp in inputs))
         if status.text:
             layout.progress(text=status.text, factor=status.fraction)
         else:

@@ -37,7 +37,7 @@ def find_fuse(preference: str = "") -> str:
     for where, name in (("the add-on's preferences", preference), ("MSSPL_FUSE", variable), ("", "msspl-fuse")):
         program = shutil.which(os.path.expanduser(name)) if name else None
         if program is not None:
-            return program
+            return os.path.abspath(program)
         if name and where:
             raise Failure(f"{name}: no such program; correct the path in {where}")
     raise Failure("msspl-fuse is not on PATH; give its path in the add-on's preferences or in the variable MSSPL_FUSE")
@@ -57,13 +57,15 @@ def find_render(preference: str = "") -> str:
 
 
 def fuse(
-    program: str, work: Path, overwrite: bool, threads: int, lrhs: str, hrls: str, output: str
+    program: str, options: Sequence[str], work: Path, renders: Sequence[str], before: float, output: str
 ) -> Generator[Progress, None, dict[str, Any]]:
-    """Fuse two files.
+    """Fuse one render or two.
 
     Args:
         program: of :func:`find_fuse`.
+        options: of msspl-fuse.
         work: a folder for temporary files.
+        before: the progress before it.
 
     Returns:
         The report of msspl-fuse.
@@ -71,14 +73,14 @@ def fuse(
     Raises:
         Failure: msspl-fuse failed. The message is its own.
     """
-    # Blender's Image node shows all passes of a single-part file only.
-    command = [program, lrhs, hrls, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
-    command += ["--overwrite"] if overwrite else []
-    command += ["--threads", str(threads)] if threads else []
+    # Blender's Image node shows all passes of a single-part file only. The result names its renders, whose folder goes.
+    names = [os.path.relpath(render, work) for render in renders]
+    command = [program, *names, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
+    command += options
 
     def progress(log: Path) -> Progress:
         steps = _STEP.findall(_read(log))
-        return "fuse", (2 + (int(steps[-1][0]) / int(steps[-1][1]) if steps else 0)) / 3
+        return "fuse", before + (1 - before) * (int(steps[-1][0]) / int(steps[-1][1]) if steps else 0)
 
     return (yield from _run("msspl-fuse", command, work, progress))
 
@@ -104,10 +106,11 @@ def render_shot(
     command = [program, bpy.data.filepath, "-o", pattern, "--frames", frames, "--json"]
     command += ["--blender", bpy.app.binary_path or sys.executable]
     command += ["--scene-name", scene.name, "--view-layer", options.view_layer]
-    command += ["--scale", str(options.scale), "--hr-spp", str(options.hr_spp), "--filter", options.filter.lower()]
-    command += ["--lr-spp", str(options.lr_spp)] if options.lr_spp else []
+    command += ["--renders", str(options.renders), "--scale", str(options.scale), "--filter", options.filter.lower()]
+    command += ["--hr-spp", str(options.hrls_spp)]
+    command += ["--lr-spp", str(options.lr_spp)] if options.lr_spp and options.scale > 1 else []
     command += ["--components"] if options.components else []
-    command += ["--threads", str(options.threads)] if options.threads else []
+    command += model_options(scene)
     command += ["--temporal", "auto" if scene.msspl.average else "off"]
     command += ["--overwrite" if overwrite else "--skip-existing"]
     files = list(outputs.values())
@@ -122,10 +125,15 @@ def render_shot(
     return (yield from _run("msspl-render", command, work, progress))
 
 
+def model_options(scene: Scene) -> list[str]:
+    """Return the options of both programs that choose the model and the device on which it runs."""
+    return ["--quality", scene.msspl.quality.lower(), "--device", scene.msspl.device.lower()]
+
+
 def _run(
     name: str, command: Sequence[str], work: Path, progress: Callable[[Path], Progress]
 ) -> Generator[Progress, None, Any]:
-    """Run a program and return the JSON that it prints. ``progress`` gets the file of its messages."""
+    """Run a program in a folder and return the JSON that it prints. ``progress`` gets the file of its messages."""
     # The program runs in another Python, which must not get the variables of Blender's.
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     environment["PYTHONUTF8"] = "1"  # Paths and messages are in UTF-8 on every platform.
@@ -134,6 +142,7 @@ def _run(
         try:
             process = subprocess.Popen(
                 command,
+                cwd=work,
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,
@@ -151,7 +160,10 @@ def _run(
         lines = _read(log).strip().splitlines() or [f"the program ended with code {process.returncode}"]
         said = next((line for line in lines if line.startswith("error: ")), lines[-1])
         raise Failure(f"{name}: {said.removeprefix('error: ')}", 2 if process.returncode == 2 else 1)
-    return json.loads(_read(report))
+    try:
+        return json.loads(_read(report))
+    except ValueError as error:
+        raise Failure(f"{command[0]}: printed no report; check that it is {name}, of the add-on's version") from error
 
 
 def _written(path: str) -> int | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The scene settings of the LRHS, of the HRLS and of an ordinary render, as ``{data path: value}``.
+"""The scene settings of the renders to fuse and of an ordinary render, as ``{data path: value}``.
 
 Dictionaries of data paths can be merged, read back and restored by code that knows none of the settings.
 """
@@ -39,12 +39,12 @@ _COMPONENTS = (
 )
 #: Names of linear colour spaces: Linear Rec.2020, lin_ap1, scene_linear, ACEScg, ACES2065-1. Blender does not tell.
 _LINEAR = re.compile(r"(?<![a-z])lin(ear)?(?![a-z])|acescg|aces2065", re.IGNORECASE)
-#: Added to the scene's seed for the LRHS. With one seed, both renders would share samples and their noise.
-_LRHS_SEED = 1009
+#: Added to the scene's seed for the first of two renders. With one seed, both would share samples and their noise.
+_FIRST_SEED = 1009
 
 
 def lrhs(scene: Scene, options: Options) -> dict[str, Any]:
-    """Return the settings of the LRHS."""
+    """Return the settings of the first of two renders. It is the LRHS, unless the scale is 1."""
     (width, height), (full_width, full_height) = lrhs_size(scene, options.scale), hrls_size(scene)
     aspect_x, aspect_y = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
     # The size is rounded up, so the pixel aspect is adjusted until the LRHS shows exactly the frame.
@@ -56,26 +56,25 @@ def lrhs(scene: Scene, options: Options) -> dict[str, Any]:
         "render.pixel_aspect_x": aspect_x / least,
         "render.pixel_aspect_y": aspect_y / least,
         "cycles.samples": options.lrhs_spp,
-        "cycles.seed": (scene.cycles.seed + _LRHS_SEED) % 2**31,
+        "cycles.seed": (scene.cycles.seed + _FIRST_SEED) % 2**31,
         # The dicing rate is in pixels. Adaptive subdivision must give both renders the same surface.
         "cycles.dicing_rate": max(0.1, scene.cycles.dicing_rate / options.scale),
     }
 
 
 def hrls(scene: Scene, options: Options) -> dict[str, Any]:
-    """Return the settings of the HRLS."""
+    """Return the settings of the HRLS, or of the last or only render of the frame's size."""
     width, height = hrls_size(scene)
     return _common(scene, options) | {
         "render.resolution_x": width,
         "render.resolution_y": height,
-        "cycles.samples": options.hr_spp,
+        "cycles.samples": options.hrls_spp,
     }
 
 
 def plain(scene: Scene, options: Options, spp: int) -> dict[str, Any]:
     """Return the settings of an ordinary render that Cycles denoises with OIDN at its highest quality."""
     return hrls(scene, options) | {
-        "render.use_persistent_data": False,  # Its time includes loading the scene, as the time of the LRHS does.
         "cycles.samples": spp,
         "cycles.use_denoising": True,
         f"{view_layer_path(find_view_layer(scene, options))}.cycles.use_denoising": True,
@@ -87,7 +86,7 @@ def plain(scene: Scene, options: Options, spp: int) -> dict[str, Any]:
 
 
 def _common(scene: Scene, options: Options) -> dict[str, Any]:
-    """Return what both renders share: the passes, unbiased and unfiltered noise, and a lossless multilayer EXR."""
+    """Return what all renders share: the passes, unbiased and unfiltered noise, and a lossless multilayer EXR."""
     image = scene.render.image_settings
     chosen = find_view_layer(scene, options)
     values = {f"{view_layer_path(layer)}.use": layer == chosen for layer in scene.view_layers}

@@ -66,9 +66,10 @@ def render_frames(
         scene: a .blend.
         job: the frames and the settings that headless.py reads.
         folder: the folder of the results. The renders lie in it, so that a render that is kept is only renamed.
-        on_event: called with each event: a step that begins, the fraction of samples that is done, or the report of a
-            frame that ended.
-        fuse: called with the files of the LRHS and of the HRLS of each frame. Its errors name the frame.
+        on_event: called with each event: a step that begins, the fraction of samples that is done, the report of a
+            frame that ended, or the ordinary render that it is compared with.
+        fuse: called with the files of both renders of each frame, or twice that of its only render. Its errors name
+            the frame.
         verbose: pass on the messages of Blender.
 
     Raises:
@@ -114,7 +115,7 @@ def run_blender(
 
     Args:
         arguments: of :func:`command`.
-        fuse: called with the files of the LRHS and of the HRLS of each frame.
+        fuse: see :func:`render_frames`.
         verbose: pass on the messages of Blender.
 
     Yields:
@@ -176,11 +177,11 @@ def _start(arguments: Sequence[str]) -> subprocess.Popen[str]:
         raise InputError(f"{arguments[0]}: can't be started ({refused.strerror}); {_NAME_ANOTHER}") from refused
 
 
-def _fuse(process: subprocess.Popen[str], files: dict[str, str], fuse: Callable[[Path, Path], None]) -> None:
+def _fuse(process: subprocess.Popen[str], files: Sequence[str], fuse: Callable[[Path, Path], None]) -> None:
     """Fuse a frame, and tell Blender to go on. An error lets Blender end by itself, because its input ends."""
     assert process.stdin is not None and process.stdout is not None
     try:
-        fuse(Path(files["lrhs"]), Path(files["hrls"]))
+        fuse(Path(files[0]), Path(files[-1]))
     except Exception:
         process.stdin.close()
         process.stdout.read()

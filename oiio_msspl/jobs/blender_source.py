@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,11 +30,19 @@ from oiio_msspl.jobs.settings import Settings, choose_model
 from oiio_msspl.jobs.timeline import neighbours
 from oiio_msspl.jobs.write import write_settled
 from oiio_msspl.model.catalogue import family_of
+from oiio_msspl.model.contract import ONE_SIZE
 
 
 def beside(output: Path, suffix: str) -> Path:
     """``frame.exr`` -> ``frame_suffix.exr``."""
     return output.with_name(f"{output.stem}_{suffix}.exr")
+
+
+def suffixes(renders: int, scale: int) -> tuple[str, ...]:
+    """Return what :func:`beside` adds to the names of a frame's renders: one, or the first and the second one."""
+    if renders == 1:
+        return ("hr",)
+    return ("a", "b") if scale == ONE_SIZE else ("lr", "hr")
 
 
 def _cycles_sets(names: Sequence[str]) -> list[AdditiveSet]:
@@ -54,7 +63,8 @@ class RenderedShot:
 
     Args:
         settings: how a frame is fused.
-        scale: width of the frame / width of the LRHS.
+        renders: 1, or 2 for each frame.
+        scale: width of the frame / width of the first of two renders.
         shot: all frames, without their renders.
         wanted: those of ``shot`` that are to be written.
         options: how many neighbours each frame is averaged with.
@@ -67,6 +77,7 @@ class RenderedShot:
     def __init__(
         self,
         settings: Settings,
+        renders: int,
         scale: int,
         shot: Sequence[FrameFiles],
         wanted: Sequence[FrameFiles],
@@ -80,6 +91,8 @@ class RenderedShot:
             raise InputError(f"--model {settings.model}: is for x{contract.scale}, but --scale is {scale}")
         settings.session(scale)  # refuses a model that does not make the layers that are asked for
         self._settings, self._scale, self._shot, self._wanted, self._keep = settings, scale, shot, list(wanted), keep
+        #: What the names of a frame's renders end with if they are kept.
+        self.suffixes = suffixes(renders, scale)
         self._required = options.frames != AUTO
         #: Number of the frame that an error is about.
         self._at_work = 0
@@ -129,7 +142,7 @@ class RenderedShot:
         """Refuse a frame that could not be fused, before it is rendered.
 
         Args:
-            size: width and height of the HRLS.
+            size: width and height of the frame.
             layers: names of the passes that Cycles will render; None if they are not known.
             pixel_bytes: bytes of all passes for each pixel, at least.
 
@@ -161,42 +174,57 @@ class RenderedShot:
         """Fuse the next frame of ``order``, and write each frame that has all its neighbours now.
 
         Args:
-            lr, hr: the renders, which are deleted or renamed when no frame needs them any more. Those of a frame that
-                can't be fused are kept beside its result.
+            lr, hr: the renders, or twice the only one. They are deleted or renamed when no frame needs them any more.
+                Those of a frame that can't be fused are kept beside its result.
 
         Raises:
-            InputError, MssplError: a frame can't be fused. The message names it if there are several.
+            InputError, MssplError: a frame can't be fused, and the message names it if there are several; or other
+                weights made the frames that exist.
         """
         if self._next is None:
             self._next = iter(self.order)
         files = replace(next(self._next), lr=lr, hr=hr)
-        self._at_work = files.number
+        self._at_work, is_first = files.number, self._run is None
+        with self._keep_if_it_fails(files):
+            run = self._prepare(files)
+        if is_first:
+            run.existing.check_weights(frame for frame in self._shot if frame not in self._wanted)
+        with self._keep_if_it_fails(files):
+            self._take(run, files)
+        self._discard()
+
+    @contextmanager
+    def _keep_if_it_fails(self, files: FrameFiles) -> Iterator[None]:
+        """Keep the renders of the frame at work if the block raises an error, and name both in the error."""
         try:
             with limit_threads(self._settings.threads):
-                self._take(files)
+                yield
         except Exception as error:
             said, code = explain(error)
             said = self._keep_failed(self._renders.get(self._at_work, files), said)
             if len(self._shot) > 1:
                 said = f"frame {self._at_work}: {said}"
             raise (InputError if code == InputError.exit_code else MssplError)(said) from error
-        self._discard()
 
-    def _take(self, files: FrameFiles) -> None:
-        """Fuse a frame that is rendered, and write each frame that has all its neighbours now."""
+    def _prepare(self, files: FrameFiles) -> ShotRun:
+        """Return the run of the shot, with the model that suits the first pair."""
         run = self._run = self._run or self._start(files)
         assert files.lr is not None and files.hr is not None
         if family_of(run.settings.model):  # all frames get the model that suits the first pair with noise
             family, told = choose_model(*map_pair(files.lr, files.hr, run.settings.inputs), run.settings.model)
             if told:
                 run.settings = replace(run.settings, model=family)
+        return run
+
+    def _take(self, run: ShotRun, files: FrameFiles) -> None:
+        """Fuse a frame that is rendered, and write each frame that has all its neighbours now."""
         views = run.read(files)
         views[0].require()
         self._renders[files.number] = files
         for frame in run.take(views):
             self._at_work = frame.number
-            kept = str(beside(frame.files.output, "lr")), str(beside(frame.files.output, "hr"))
-            frame.report.sources = kept if self._keep else ("a render that was not kept",) * 2
+            lr, hr = (str(beside(frame.files.output, self.suffixes[index])) for index in (0, -1))
+            frame.report.sources = (lr, hr) if self._keep else ("a render that was not kept",) * 2
             write_settled(frame, run.existing)
             self._warnings[frame.files.output] = frame.report.warnings
 
@@ -224,20 +252,26 @@ class RenderedShot:
         Returns:
             The error, with the names of the files that are kept.
         """
-        assert files.lr is not None and files.hr is not None
-        renders = ((files.lr, "lr", "the LRHS"), (files.hr, "hr", "the HRLS"))
-        if not all(path.exists() for path, _, _ in renders):  # Blender wrote none, and the error says so
+        kept = self._places(files)
+        if not all(path.exists() for path in kept):  # Blender wrote none, and the error says so
             return said
-        kept = {path: beside(files.output, suffix) for path, suffix, _ in renders}
         wanted = any(files.output == frame.output for frame in self._wanted)
         if not wanted or (not self._keep and any(target.exists() for target in kept.values())):
-            for path, _, name in renders:
+            names = ("the LRHS", "the HRLS") if self._scale != ONE_SIZE else ("the first render", "the second render")
+            for path, name in zip(kept, names if len(kept) > 1 else ["the render"], strict=True):
                 said = said.replace(str(path), name)
             return said
         for path, target in kept.items():
             os.replace(path, target)
             said = said.replace(str(path), str(target))
-        return f"{said}; both renders are kept for msspl-fuse: {', '.join(map(str, kept.values()))}"
+        subject = "both renders are" if len(kept) > 1 else "the render is"
+        return f"{said}; {subject} kept for msspl-fuse: {', '.join(map(str, kept.values()))}"
+
+    def _places(self, files: FrameFiles) -> dict[Path, Path]:
+        """Return where each render of a frame is kept, by its temporary file. An only render is there once."""
+        assert files.lr is not None and files.hr is not None
+        paths = dict.fromkeys((files.lr, files.hr))
+        return {path: beside(files.output, name) for path, name in zip(paths, self.suffixes, strict=True)}
 
     def waits(self, output: Path) -> bool:
         """Return whether a frame is rendered, and waits for its neighbours."""
@@ -253,9 +287,8 @@ class RenderedShot:
         needed = {n for number in missing for n in (number, *neighbours(number, self._plan.count, self._plan.frames))}
         for number in self._renders.keys() - needed:
             files = self._renders.pop(number)
-            assert files.lr is not None and files.hr is not None
-            for path, suffix in ((files.lr, "lr"), (files.hr, "hr")):
+            for path, target in self._places(files).items():
                 if self._keep and files.output in self._warnings:
-                    os.replace(path, beside(files.output, suffix))
+                    os.replace(path, target)
                 else:
                     path.unlink()

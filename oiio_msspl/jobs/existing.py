@@ -19,7 +19,7 @@ from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, older_than, result_of
 from oiio_msspl.model.catalogue import model_files
-from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.contract import ONE_SIZE, SCALES
 from oiio_msspl.model.digests import as_text, digests
 
 #: Seconds by which the clocks of two machines may differ.
@@ -98,7 +98,7 @@ class ExistingResults:
         model, device = self.settings.model, self.settings.device
         for files in skipped:
             scale, made_by = _made_by(files.output)
-            if scale not in SCALES or not made_by:
+            if scale not in (ONE_SIZE, *SCALES) or not made_by:
                 continue
             now = as_text(digests(model_files(scale, model), device))
             if made_by != now:

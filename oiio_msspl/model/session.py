@@ -73,6 +73,8 @@ class Session:
             )
         self.path, self.layers, self.half_layers = Path(path), layers, half_layers
         self.device, self.threads = device, threads
+        self.weights = digests([path for path in (self.path, layers, half_layers) if path], device)
+        """The digests of this model and of those that fuse passes, by name, of the files that are loaded now."""
         self.seconds = 0.0
         """Time spent in :meth:`run` so far."""
         self._largest = 0
@@ -93,11 +95,6 @@ class Session:
     def name(self) -> str:
         """The model's name, as ``--model`` takes it."""
         return self.contract.name
-
-    @functools.cached_property
-    def weights(self) -> dict[str, str]:
-        """The digests of this model and of those that fuse passes, by name."""
-        return digests([path for path in (self.path, self.layers, self.half_layers) if path], self.device)
 
     def require_error(self) -> None:
         """Raise InputError if the model does not predict its error."""

@@ -66,16 +66,53 @@ def layer(path, name, components):
 
 def test_the_composited_frame_equals_the_fused_file(results):
     for name, components in (("Combined", "RGBA"), ("Mist", "ZZZ"), ("Normal", "XYZ")):
-        fused = layer(results / "fused_012.exr", f"ViewLayer.{name}.", components)
+        fused = layer(results / "fused_ViewLayer_012.exr", f"ViewLayer.{name}.", components)
         composited = layer(results / f"composited_{name}.exr", "", "RGBA"[: len(components)])
         np.testing.assert_array_equal(composited, fused)
         assert fused.std() > 0.01
 
 
 def test_each_frame_of_the_composited_animation_equals_its_fused_file(results):
-    fused = layer(results / "shot_13.exr", "ViewLayer.Combined.", "RGBA")
+    fused = layer(results / "ViewLayer_13.exr", "ViewLayer.Combined.", "RGBA")
     np.testing.assert_array_equal(layer(results / "composited_shot.exr", "", "RGBA"), fused)
     assert fused.std() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "spp", "scale"), [("ONE", [None, "8"], "1"), ("TWO", ["4", "4"], "1"), ("SIZES", ["16", "1"], "4")]
+)
+def test_the_button_fuses_one_render_or_two_seeds_or_two_sizes(results, name, spp, scale):
+    """The result names its renders, but not the folder that they lay in."""
+    made = open_exr(results / f"renders_{name}.exr").metadata
+    assert [made.get("msspl/spp_lrhs"), made["msspl/spp_hrls"]] == spp
+    assert (made["msspl/scale"], made["msspl/hrls"]) == (scale, "hr.exr")
+
+
+def test_two_seeds_have_two_noises(python, results, tmp_path):
+    options = ["--blender", python, "--view-layer", "ViewLayer", "--renders", "2", "--hr-spp", "2", "--keep"]
+    done = msspl_render(results / "scene.blend", *options, "-o", tmp_path / "out.exr")
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.exr", "out_a.exr", "out_b.exr"]
+    a, b = (layer(tmp_path / f"out_{name}.exr", "ViewLayer.Combined.", "RGB") for name in "ab")
+    assert a.shape == b.shape and np.abs(a - b).mean() > 0.1 * np.abs(a - np.median(a)).mean()
+    assert a.mean() == pytest.approx(b.mean(), rel=0.05)
+
+
+def test_frames_that_share_a_loaded_scene_have_the_pixels_of_frames_that_load_it(python, results, tmp_path):
+    """All channels of both renders, with a moving camera and a moving object."""
+    options = ["--blender", python, "-s", "2", "--hr-spp", "2", "--quality", "fast", "--keep"]
+    done = msspl_render(results / "motion.blend", *options, "--frames", "1-3", "-o", tmp_path / "shot.#.exr")
+    assert done.returncode == 0, done.stderr
+    for number in (2, 3):
+        one = ["--frames", f"{number}", "-o", tmp_path / f"alone.{number}.exr"]
+        done = msspl_render(results / "motion.blend", *options, *one)
+        assert done.returncode == 0, done.stderr
+        for suffix in ("lr", "hr"):
+            shot, alone = (open_exr(tmp_path / f"{name}.{number}_{suffix}.exr").parts[0] for name in ("shot", "alone"))
+            names = [channel.name for channel in alone.channels]
+            assert names == [channel.name for channel in shot.channels] and len(names) > 30
+            paths = [tmp_path / f"{name}.{number}_{suffix}.exr" for name in ("shot", "alone")]
+            np.testing.assert_array_equal(*(layer(path, "", names) for path in paths))
 
 
 def test_frames_have_the_linear_space_of_the_output_and_the_compositor_converts_it_back(results):
@@ -90,10 +127,10 @@ def test_frames_have_the_linear_space_of_the_output_and_the_compositor_converts_
 
 
 def test_the_animation_button_renders_what_averaging_needs(results):
-    names = [channel.name for part in open_exr(results / "shot_12.exr").parts for channel in part.channels]
+    names = [channel.name for part in open_exr(results / "ViewLayer_12.exr").parts for channel in part.channels]
     assert "ViewLayer.Vector.X" in names
     assert "ViewLayer.Vector.X" not in [
-        c.name for part in open_exr(results / "fused_012.exr").parts for c in part.channels
+        c.name for part in open_exr(results / "fused_ViewLayer_012.exr").parts for c in part.channels
     ]
 
 
@@ -214,10 +251,10 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
     assert [report["frame"] for report in reports] == [3, 4]
     for report in reports:
         # The LRHS gets a third of the HRLS's samples: 4/3 x 2 x 2 per pixel, rounded up. Nothing warns of it.
-        assert (report["lrhs"]["size"], report["lrhs"]["spp"]) == ([51, 38], 6)
-        assert (report["hrls"]["size"], report["hrls"]["spp"]) == ([101, 75], 4)
+        renders = [(render["name"], render["size"], render["spp"]) for render in report["renders"]]
+        assert renders == [("LRHS", [51, 38], 6), ("HRLS", [101, 75], 4)]
         assert not [warning for warning in report["warnings"] if "spp" in warning]
-        stages = report["lrhs"]["seconds"], report["hrls"]["seconds"], report["fuse_seconds"]
+        stages = [*(render["seconds"] for render in report["renders"]), report["fuse_seconds"]]
         assert report["seconds"] == pytest.approx(sum(stages))
         assert report["plain_spp"] > 3
         assert report["oidn"]["spp"] >= 1

@@ -17,6 +17,7 @@ from msspl_cli.blender_process import command, find_blender
 from msspl_cli.commands.render import _Printer, name_targets
 from msspl_cli.extension import find_extension
 
+from oiio_msspl import fuse_files
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import temporary_folder
 from oiio_msspl.exr.reader import open_exr
@@ -26,7 +27,8 @@ from oiio_msspl.jobs.plan import TemporalOptions
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot import fuse_shot
-from tests.conftest import EXAMPLES
+from tests.conftest import EXAMPLES, downsample, noisy, picture, rgb, write_exr
+from tests.jobs.test_one_size import write_render
 from tests.jobs.test_over_time import make_moving_shot
 from tests.programs import leave_temporary, start
 from tests.shots import pixels
@@ -88,27 +90,30 @@ for number, output in job["frames"]:
     print("Fra:1 Mem:8M | Sample 1/2", flush=True)
     {code}
     Path(output).write_text(json.dumps([sys.argv[1:], job]))
-    take = dict(name="LRHS", size=[16, 9], spp=16, seconds=1.0, file=None)
-    tell(report=dict(frame=number, output=output, lrhs=take, hrls=take, fuse_seconds=0.5, seconds=2.5, plain_spp=2.25,
+    renders = [dict(name=f"render {n}", size=[16, 9], spp=16, seconds=1.0, file=None)
+               for n in range(job["options"]["renders"])]
+    tell(report=dict(frame=number, output=output, renders=renders, fuse_seconds=0.5, seconds=2.5, plain_spp=2.25,
                      warnings=["the moon is full"]))
 """
 
 
 @pytest.fixture
 def farm(tmp_path):
-    """Return functions that run msspl-render with a stand-in for Blender, which does ``code`` while it renders."""
+    """Return functions that run msspl-render with a stand-in for Blender, which does ``code`` while it renders, and
+    ``after`` at its end."""
     (tmp_path / "scene.blend").write_text("")
 
-    def start_render(*arguments, code="pass", stderr=subprocess.PIPE):
+    def start_render(*arguments, code="pass", after="", stderr=subprocess.PIPE):
         blender = tmp_path / "blender"
-        blender.write_text(f"#!{sys.executable}\n{FAKE.replace('{code}', code)}")
+        blender.write_text(f"#!{sys.executable}\n{FAKE.replace('{code}', code)}{after}")
         blender.chmod(0o755)
         main = "import sys; from msspl_cli.app import msspl_render as main; sys.argv[0] = 'msspl-render'; main()"
-        command = [sys.executable, "-c", main, "scene.blend", "-o", "out.exr", "--blender", str(blender), *arguments]
+        command = [sys.executable, "-c", main, "scene.blend", "-o", "out.exr", "-s", "4"]
+        command += ["--blender", str(blender), *arguments]
         return start(command, cwd=tmp_path, stderr=stderr)
 
-    def run(*arguments, code="pass"):
-        with start_render(*arguments, code=code) as process:
+    def run(*arguments, **scripts):
+        with start_render(*arguments, **scripts) as process:
             out, err = process.communicate()
         left = sorted(p.name for p in tmp_path.iterdir() if p.name not in ("blender", "scene.blend", "log"))
         return process.returncode, out, err, left
@@ -122,13 +127,13 @@ def test_options_reach_blender_and_times_are_printed(farm):
     options = ["-s", "8", "--hr-spp", "2", "--filter", "scene", "--threads", "3", "--components", "--frame", "7"]
     code, out, err, left = run(*options)
     assert (code, left) == (0, ["out.exr"]), err
-    assert "7      1.00    1.00    0.50    2.50   about 2.2 spp" in out
+    assert re.search(r"7 +1.00 +1.00 +0.50 +2.50 +about 2.2 spp", out)
     assert err == "warning: frame 7: the moon is full\n"
     argv, job = json.loads((folder / "out.exr").read_text())
     assert argv[:2] == ["--background", str(folder / "scene.blend")]
     assert Path(argv[3]).is_file()
     assert job["options"] == {
-        **{"scale": 8, "hr_spp": 2, "lr_spp": 0, "filter": "SCENE", "view_layer": "", "threads": 3},
+        **{"renders": 2, "scale": 8, "hr_spp": 2, "lr_spp": 0, "filter": "SCENE", "view_layer": "", "threads": 3},
         **{"components": True, "vectors": False},
     }
     assert job["frames"] == [[7, str(folder / "out.exr")]]
@@ -143,13 +148,14 @@ ASKS = f"""
     for path, name in zip(pair, ("LR", "HR")):
         shown = os.environ.get(name, {str(EXAMPLES)!r} + f"/{{name.lower()}}.exr")
         if Path(shown.format(number)).exists(): shutil.copy(shown.format(number), path)
-    tell(fuse=dict(lrhs=str(pair[0]), hrls=str(pair[1])))
+    tell(fuse=[str(path) for path in pair[-job["options"]["renders"]:]])
     sys.stdin.readline() or sys.exit(1)
     Path(os.environ["MODEL"]).write_text("spoilt")
-    def take(name): return dict(name=name, size=[16, 9], spp=16, seconds=1.0, file="")
+    renders = [dict(name=f"render {{n}}", size=[16, 9], spp=16, seconds=1.0, file="")
+               for n in range(job["options"]["renders"])]
     if output:
-        tell(report=dict(frame=number, output=output, lrhs=take("LRHS"), hrls=take("HRLS"), fuse_seconds=0.5,
-                         seconds=2.5, plain_spp=2.25, warnings=[]))
+        tell(report=dict(frame=number, output=output, renders=renders, fuse_seconds=0.5, seconds=2.5, plain_spp=2.25,
+                         warnings=[]))
     continue
 """
 
@@ -176,6 +182,51 @@ def test_frames_are_fused_here_with_the_options_of_msspl_fuse_and_a_model_that_s
         assert [part.name for part in parts[:2]] == ["rgba", "error"]
         assert parts[0].spec.getattribute("msspl/model") == "bilinear-x4"
         assert (parts[0].spec.getattribute("msspl/passes") == "[]") == (passes == "none")
+
+
+@posix
+@pytest.mark.parametrize(
+    ("options", "names"), [([], ["hr"]), (["--renders", "2"], ["a", "b"]), (["-s", "2"], ["lr", "hr"])]
+)
+def test_a_frame_is_one_render_or_two_seeds_or_two_sizes(farm, monkeypatch, options, names):
+    """The result is that of msspl-fuse on these files, which are kept under names that say what they are."""
+    _, run, folder = farm
+    inputs = folder.parent / f"{folder.name}-inputs"
+    inputs.mkdir()
+    first, last = (write_render(inputs / f"{seed}.exr", seed) for seed in (1, 2))
+    if "-s" in options:
+        write_exr(first, rgb(noisy(downsample(picture(96, 132), 2), 8, 1)))
+    fuse_files(first if len(names) == 2 else None, last, inputs / "out.exr", model="fast")
+    for name, value in {"LR": first, "HR": last, "MODEL": inputs / "unused"}.items():
+        monkeypatch.setenv(name, str(value))
+    code, out, err, left = run(
+        "-s", "1", *options, "--quality", "fast", "--layout", "spec", "--keep", "--json", code=ASKS
+    )
+    assert (code, err) == (0, "")
+    assert left == sorted(["out.exr", *(f"out_{name}.exr" for name in names)])
+    files = [render["file"] for render in json.loads(out)[0]["renders"]]
+    assert files == [str(folder / f"out_{name}.exr") for name in names]
+    made = open_exr(folder / "out.exr").metadata
+    assert [made.get("msspl/lrhs"), made["msspl/hrls"]][-len(names) :] == files
+    assert pixels(folder)["out.exr"] == pixels(inputs)["out.exr"]
+
+
+@posix
+@pytest.mark.parametrize("options", [["-s", "1"], ["-s", "4"]])
+def test_a_shot_is_not_resumed_with_other_weights(farm, model, monkeypatch, options):
+    """Nothing is left of the frame that was rendered to find the model."""
+    _, run, folder = farm
+    monkeypatch.setenv("MODEL", str(folder.parent / "unused"))
+    shot = ["-o", "out.##.exr", "--frames", "1-2", *options]
+    assert run(*shot, "--quality", "fast", code=ASKS)[0] == 0
+    (folder / "out.02.exr").unlink()
+    before = (folder / "out.01.exr").read_bytes()
+    code, _, err, left = run(*shot, "--quality", "best", "--skip-existing", code=ASKS)
+    assert (code, left, err.count("\n")) == (2, ["out.01.exr"], 1)
+    assert re.match(r"error: \S+out.01.exr: was fused by other weights \(joint-small-x\d \w+\) than the frames", err)
+    assert run(*shot, "--quality", "fast", "--skip-existing", code=ASKS)[::3] == (0, ["out.01.exr", "out.02.exr"])
+    assert (folder / "out.01.exr").read_bytes() == before
+    assert run(*shot, "--quality", "best", "--overwrite", code=ASKS)[0] == 0
 
 
 @posix
@@ -238,7 +289,7 @@ def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, 
     monkeypatch.setattr(read, "_read_pixels", lambda frame: loaded.append(load(frame) or frame))
     monkeypatch.setattr(memory, "_vector_bytes", lambda hr, channels: counted.append(channels) or counts(hr, channels))
     frames = [FrameFiles(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
-    shot = RenderedShot(Settings(model=str(bilinear_models[4])), 4, frames, frames, TemporalOptions("auto"))
+    shot = RenderedShot(Settings(model=str(bilinear_models[4])), 2, 4, frames, frames, TemporalOptions("auto"))
     for frame in shot.order:
         pair = [moving / f"{render}/{render}.{frame.number}.exr" for render in ("lr", "hr")]
         shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))
@@ -344,7 +395,8 @@ def test_renders_are_kept_beside_each_frame(farm, model):
     assert (code, err) == (0, "")
     assert left == [f"out.0{number}{suffix}.exr" for number in (1, 2) for suffix in ("", "_hr", "_lr")]
     assert (folder / "out.01_lr.exr").read_bytes() == (EXAMPLES / "lr.exr").read_bytes()
-    assert json.loads(out)[1]["hrls"]["file"] == str(folder / "out.02_hr.exr")
+    files = [render["file"] for render in json.loads(out)[1]["renders"]]
+    assert files == [str(folder / f"out.02_{suffix}.exr") for suffix in ("lr", "hr")]
 
 
 @posix
@@ -356,6 +408,16 @@ def test_a_shot_and_a_report_for_machines(farm):
 
 
 @posix
+def test_frames_are_compared_after_the_last_one(farm):
+    """Blender tells of each ordinary render, which then belongs to the frame's report."""
+    _, run, _ = farm
+    told = "for n in (1, 2): tell(frame=n, oidn=dict(spp=n + 4, seconds=2.4, file=f'{n}_oidn.exr'))"
+    code, out, _, _ = run("-o", "out.##.exr", "--frames", "1-2", "--compare", "--json", after=told)
+    assert code == 0
+    assert [(report["frame"], report["oidn"]["spp"]) for report in json.loads(out)] == [(1, 5), (2, 6)]
+
+
+@posix
 @pytest.mark.parametrize(
     ("arguments", "code", "status", "message"),
     [
@@ -363,7 +425,9 @@ def test_a_shot_and_a_report_for_machines(farm):
         ([], "tell(error='disk full', code=1); sys.exit(1)", 1, "error: disk full"),
         ([], "print('Segmentation fault'); sys.stdout.flush(); os._exit(11)", 1, "code 11: .*Segmentation fault"),
         ([], "break", 1, "ended after 0 of 1 frames"),
-        (["--scale", "3"], "", 2, "--scale 3: use one of 2, 4, 8"),
+        (["--scale", "3"], "", 2, "--scale 3: use one of 1, 2, 4, 8"),
+        (["-s", "1", "--lr-spp", "4"], "", 2, "--lr-spp: is for a low-resolution render; give --scale, too"),
+        (["--renders", "1"], "", 2, "--renders 1: does not go with --scale 4"),
         (["--filter", "gauss"], "", 2, "--filter 'gauss': use one of box, scene"),
         (["-o", "x.png"], "", 2, "x.png: the result is an EXR"),
         (["-o", "nowhere/x.exr"], "", 2, "the folder nowhere does not exist"),
@@ -520,9 +584,9 @@ def test_a_blender_that_ends_while_its_frame_is_fused_is_named(farm, model):
 
 
 def test_the_bar_covers_the_whole_run(monkeypatch):
-    """It grows from frame to frame, and each render is a third of a frame."""
+    """It grows from frame to frame, and each of two renders is a third of a frame."""
     told = []
-    shot = SimpleNamespace(order=[1, 2], waits=lambda output: True)
+    shot = SimpleNamespace(order=[1, 2], suffixes=("lr", "hr"), waits=lambda output: True)
     printer = _Printer(shot, quiet=False, verbose=False, keep=False)
     monkeypatch.setattr(printer._bar, "update", lambda label, done, total: told.append((label, done / total)))
     for frame in (1, 2):

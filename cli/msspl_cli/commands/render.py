@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 EXAMPLES = """[bold]Examples[/bold]
 
+  msspl-render scene.blend -o frame.exr
+
+  msspl-render scene.blend --renders 2 --hr-spp 4 -o frame.exr
+
   msspl-render scene.blend -s 4 --lr-spp 16 --hr-spp 1 -o frame.exr
 
   msspl-render scene.blend -o shot/frame.####.exr --frames 1001-1100 --skip-existing
@@ -40,7 +44,9 @@ Target = tuple[int | None, Path]
 
 _SCENE_NAME = "Render this scene, if the file has several. Without it: the one that was active when it was saved."
 _BLENDER = "Run this Blender (4.5 or later) or Python with bpy. Without it: MSSPL_BLENDER, or blender on the path."
-_SCALE = "Divide width and height of the low-resolution render by 2, 4 or 8."
+_RENDERS = "Render each frame once (1), or twice with another noise seed each (2). \\[default: 1, or 2 with --scale]"
+_SCALE = "Render two sizes: the first render has 1/2, 1/4 or 1/8 of the width and height. 1: the frame's size."
+_HR_SPP = "Render N samples per pixel, each time at full resolution. \\[default: 8, 4 with --renders 2, 1 with --scale]"
 _LR_SPP = (
     "Render N samples per pixel at low resolution. \\[default: a third as many samples in total as the "
     "full-resolution render has, but at least 4, 16 or 64 at x2, x4 or x8]"
@@ -48,6 +54,7 @@ _LR_SPP = (
 _FILTER = "Filter pixels with box, which is sharpest, or scene for the scene's own filter."
 _COMPONENTS = "Render all component passes, from diffuse to volume, besides the passes that the scene has on."
 _THREADS = "Use N CPU threads. 0: as the scene says, or one on each core."
+_KEEP = "Keep the renders beside OUT: OUT_hr.exr; OUT_a.exr and OUT_b.exr; or OUT_lr.exr and OUT_hr.exr."
 _FRAMES = (
     "Render only these frames: 7, 1001-1100x2 or 1001,1005-1010. Without it: the frame at which the scene was saved."
 )
@@ -63,9 +70,10 @@ def render(
     scene_name: Annotated[str, option(INPUT, _SCENE_NAME, metavar="NAME", show_default=False, hidden=True)] = "",
     blender: Annotated[str | None, option(INPUT, _BLENDER, metavar="PROGRAM")] = None,
     # Render
-    scale: Annotated[int, option(RENDER, _SCALE, "--scale", "-s", metavar="N")] = 4,
+    renders: Annotated[int | None, option(RENDER, _RENDERS, min=1, max=2, metavar="N", show_default=False)] = None,
+    scale: Annotated[int, option(RENDER, _SCALE, "--scale", "-s", metavar="N")] = 1,
     lr_spp: Annotated[int | None, option(RENDER, _LR_SPP, min=1, metavar="N", show_default=False)] = None,
-    hr_spp: Annotated[int, option(RENDER, "Render N samples per pixel at full resolution.", min=1, metavar="N")] = 1,
+    hr_spp: Annotated[int | None, option(RENDER, _HR_SPP, min=1, metavar="N", show_default=False)] = None,
     pixel_filter: Annotated[str, option(RENDER, _FILTER, "--filter", metavar="NAME", hidden=True)] = "box",
     components: Annotated[bool, option(RENDER, _COMPONENTS, "--components")] = False,
     threads: Annotated[int, option(RENDER, _THREADS, min=0, max=MOST_THREADS, metavar="N", hidden=True)] = 0,
@@ -84,9 +92,7 @@ def render(
     data_passes: options.DataPasses = False,
     trust: options.Trust = "on",
     trust_layer: options.TrustLayer = False,
-    keep: Annotated[
-        bool, option(OUTPUT, "Keep both renders beside OUT: OUT_lr.exr, OUT_hr.exr.", "--keep", hidden=True)
-    ] = False,
+    keep: Annotated[bool, option(OUTPUT, _KEEP, "--keep", hidden=True)] = False,
     compare: Annotated[
         bool, option(OUTPUT, "Also render the ordinary way, with OIDN, in the same time: OUT_oidn.exr.", "--compare")
     ] = False,
@@ -102,7 +108,7 @@ def render(
     help_all: options.HelpAll = False,
     version: options.Version = False,
 ) -> None:
-    """Render a Blender scene at low and at full resolution, and fuse the two.
+    """Render a Blender scene once, twice, or at two sizes, and fuse the renders.
 
     OUT gets the fused beauty and every pass of the scene. The time of each step
     is printed, and the samples that ordinary rendering reaches in that time.
@@ -110,24 +116,22 @@ def render(
     if not scene.is_file():
         raise InputError(f"{scene}: no such file")
     from oiio_msspl.exr.reader import use_threads
-    from oiio_msspl.jobs.blender_source import RenderedShot, beside
+    from oiio_msspl.jobs.blender_source import RenderedShot, beside, suffixes
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import FrameFiles
     from oiio_msspl.jobs.settings import Settings, bytes_of
-    from oiio_msspl.model.contract import SCALES
 
-    for name, value, choices in (("--scale", scale, SCALES), ("--filter", pixel_filter, ("box", "scene"))):
-        if value not in choices:
-            raise InputError(f"{name} {value!r}: use one of {', '.join(map(str, choices))}")
+    if pixel_filter not in ("box", "scene"):
+        raise InputError(f"--filter {pixel_filter!r}: use one of box, scene")
+    renders = _count_renders(renders, scale, lr_spp)
     program = find_blender(blender)
     over_time = TemporalOptions(temporal)
     if overwrite and skip_existing:
         raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
     shot = name_targets(output, frames)
     targets = [path for _, path in shot if not (skip_existing and path.exists())]
-    extras = [
-        beside(path, name) for path in targets for name, on in (("lr", keep), ("hr", keep), ("oidn", compare)) if on
-    ]
+    names = [*(suffixes(renders, scale) if keep else ()), *(["oidn"] if compare else ())]
+    extras = [beside(path, name) for path in targets for name in names]
     _check_files(scene, output, targets, extras, overwrite=overwrite, skip_existing=skip_existing)
     use_threads(threads)
     settings = Settings(
@@ -143,7 +147,7 @@ def render(
     # A scene without a number is one frame, numbered 0.
     files = {path: FrameFiles(number or 0, None, None, path.absolute()) for number, path in shot}
     wanted = [files[path] for path in targets]
-    fused = RenderedShot(settings, scale, list(files.values()), wanted, over_time, keep=keep)
+    fused = RenderedShot(settings, renders, scale, list(files.values()), wanted, over_time, keep=keep)
     results = {frame.number: str(frame.output) for frame in wanted}
     job = {
         "scene": str(scene.absolute()),
@@ -152,8 +156,9 @@ def render(
         # for its neighbours.
         "frames": [(None if frames is None else frame.number, results.get(frame.number)) for frame in fused.order],
         "options": {
+            "renders": renders,
             "scale": scale,
-            "hr_spp": hr_spp,
+            "hr_spp": hr_spp or 0,
             "lr_spp": lr_spp or 0,
             "filter": pixel_filter.upper(),
             "view_layer": view_layer,
@@ -183,6 +188,23 @@ def render(
         printer.end(as_json)
     if not (targets or as_json or quiet):
         print(f"{output}: every frame exists")
+
+
+def _count_renders(renders: int | None, scale: int, lr_spp: int | None) -> int:
+    """Return how often a frame is rendered.
+
+    Raises:
+        InputError: there is no such scale, or the options do not fit together.
+    """
+    from oiio_msspl.model.contract import ONE_SIZE, SCALES
+
+    if scale not in (ONE_SIZE, *SCALES):
+        raise InputError(f"--scale {scale}: use one of {', '.join(map(str, (ONE_SIZE, *SCALES)))}")
+    if scale == ONE_SIZE and lr_spp is not None:
+        raise InputError("--lr-spp: is for a low-resolution render; give --scale, too")
+    if scale != ONE_SIZE and renders == 1:
+        raise InputError(f"--renders 1: does not go with --scale {scale}, which renders two sizes; leave one out")
+    return renders or (1 if scale == ONE_SIZE else 2)
 
 
 def name_targets(output: Path, frames: str | None) -> list[Target]:
@@ -254,10 +276,12 @@ class _Printer:
         if "report" in event:
             self._waiting.append(event["report"])
             self._done, self._fraction = self._done + 1, 0.0
-        else:  # each render is a third of the work
-            done = self._done + self._fraction + event.get("samples", 0) / 3
+        else:  # each render takes as long as the fusion
+            done = self._done + self._fraction + event.get("samples", 0) / (len(self._shot.suffixes) + 1)
             self._bar.update(self._label, done, len(self._shot.order))
         self._add_written()
+        if "oidn" in event:
+            next(report for report in self._reports if report["frame"] == event["frame"])["oidn"] = event["oidn"]
 
     def _add_written(self) -> None:
         """Keep the reports of frames that are written, and print their warnings."""
@@ -267,8 +291,8 @@ class _Printer:
             report = self._waiting.pop(0)
             report["temporal"] = self._shot.text
             report["warnings"] += [*self._warnings, *self._shot.warnings(result)]
-            for render, suffix in (("lrhs", "lr"), ("hrls", "hr")):
-                report[render]["file"] = str(beside(result, suffix)) if self._keep else None
+            for render, suffix in zip(report["renders"], self._shot.suffixes, strict=True):
+                render["file"] = str(beside(result, suffix)) if self._keep else None
             self._reports.append(report)
             self._bar.hide()
             for warning in () if self._quiet else report["warnings"]:
@@ -292,9 +316,10 @@ def _print_times(reports: Sequence[dict[str, Any]], *, alone: bool) -> None:
     The time of a frame that is averaged does not tell, because it holds the work for frames that waited for it.
     """
     first, last = reports[0], reports[-1]
-    for key in ("lrhs", "hrls"):
-        print(f"{key.upper()} {first[key]['size'][0]}x{first[key]['size'][1]}, {first[key]['spp']} spp")
-    titles = ("frame", "LRHS s", "HRLS s", "fuse s", "all s", "plain rendering in that time")
+    for render in first["renders"]:
+        print(f"{render['name']} {render['size'][0]}x{render['size'][1]}, {render['spp']} spp")
+    names = [f"{render['name']} s" for render in first["renders"]]
+    titles = ("frame", *names, "fuse s", "all s", "plain rendering in that time")
     columns = len(titles) if alone or any("oidn" in report for report in reports) else len(titles) - 1
     rows: list[tuple[str, ...]] = [titles[:columns]]
     for report in reports:
@@ -304,7 +329,7 @@ def _print_times(reports: Sequence[dict[str, Any]], *, alone: bool) -> None:
             if oidn
             else f"about {report['plain_spp']:.1f} spp"
         )
-        seconds = report["lrhs"]["seconds"], report["hrls"]["seconds"], report["fuse_seconds"], report["seconds"]
+        seconds = *(render["seconds"] for render in report["renders"]), report["fuse_seconds"], report["seconds"]
         rows.append((str(report["frame"]), *(f"{value:.2f}" for value in seconds), plain)[:columns])
     console.table(rows, header=True)
     print(f"Wrote {first['output']}" + (f" to {last['output']}" if last is not first else ""))

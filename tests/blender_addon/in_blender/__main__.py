@@ -24,6 +24,14 @@ from check_button import (
 )
 from check_motion import render_motion
 from check_passes import check_passes
+from check_renders import (
+    check_choices,
+    check_compositing,
+    check_layers,
+    check_loaded_once,
+    check_renders,
+    check_seed,
+)
 from check_scene import check_animated, check_changes, check_samples, check_sentences, render_ramps
 from support import MODULE, WORK, build_scene
 
@@ -53,6 +61,12 @@ if __name__ == "__main__":
     check_changes(scene)
     check_modes(scene)
     check_cancel(scene)
+    check_renders(scene)
+    check_choices(scene)
+    check_seed(scene)
+    check_compositing(scene)
+    check_loaded_once(scene)
+    check_layers(scene)
     check_animation_button(build_scene())
     render_ramps()
     check_passes()

@@ -34,10 +34,10 @@ def check_button(scene):
     assert [node.name for node in tree.nodes if node.bl_idname == "CompositorNodeImage"] == ["MSSPL Fused"]
     assert blur.inputs[0].links[0].from_node == node
     assert output.inputs[0].links[0].from_node == blur
-    assert node.image.filepath == "//fused_012.exr"
+    assert node.image.filepath == "//fused_ViewLayer_012.exr"
     if not BLENDER_5:  # Nodes that are turned off still belong to the user.
         scene.use_nodes = False
-        module("compositor").show(scene, "//fused_012.exr", False)
+        module("compositor").show(scene, "ViewLayer", "//fused_ViewLayer_012.exr", False)
         assert output.inputs[0].links[0].from_node == blur
     scene.msspl.connect = True
     assert bpy.ops.msspl.fuse() == {"FINISHED"}
@@ -53,7 +53,7 @@ def check_colour_space(scene):
     test_in_blender.py compares the files that are left here.
     """
     settings, override = module("render_settings"), module("overrides").override
-    options, image = module("options").Options(view_layer="ViewLayer"), "render.image_settings"
+    options, image = module("options").Options(renders=2, scale=4, view_layer="ViewLayer"), "render.image_settings"
     scene.msspl.connect = True
     scene.world.node_tree.nodes["Background"].inputs[0].default_value = (0.9, 0.2, 0.1, 1)
     for name, kept in (("ACEScg", True), ("sRGB", False)):
@@ -73,7 +73,7 @@ def check_colour_space(scene):
             assert bpy.ops.msspl.fuse() == {"FINISHED"}
             assert snapshot(scene) == before
             assert scene.render.image_settings.linear_colorspace_settings.name == name
-        shutil.copy(WORK / "fused_001.exr", WORK / f"space_{name}.exr")
+        shutil.copy(WORK / "fused_ViewLayer_001.exr", WORK / f"space_{name}.exr")
         tree = scene.compositing_node_group if BLENDER_5 else scene.node_tree
         node = tree.nodes["MSSPL Fused"]
         node.image.filepath = f"//space_{name}.exr"
@@ -85,14 +85,16 @@ def check_colour_space(scene):
 def check_animation_button(scene):
     """Frames of the saved file are rendered, averaged, fused and shown; those that exist are left alone."""
     for name in ("shot.exr", "shot_##_v2.exr", "take2##.exr"):
-        assert "with #### as the last number" in sentence("fuse_animation", **{"msspl.output": f"//{name}"})
+        assert "with #### as the last number" in sentence(
+            "fuse_animation", **{"msspl.output": f"//{{view_layer}}/{name}"}
+        )
     assert "turn Render Region off" in sentence("fuse_animation", **{"render.use_border": True})
     scene.frame_start, scene.frame_end, scene.frame_step = 11, 13, 1
-    scene.msspl.output = "//shot_##.exr"
+    scene.msspl.output = "//{view_layer}_##.exr"
     bpy.context.window.scene = bpy.data.scenes.new("Other")
     bpy.ops.wm.save_mainfile()
     bpy.context.window.scene = scene  # the window shows another scene than the file
-    files = [WORK / f"shot_{number}.exr" for number in (11, 12, 13)]
+    files = [WORK / f"ViewLayer_{number}.exr" for number in (11, 12, 13)]
     before = snapshot(scene), scene.frame_current
     assert bpy.ops.msspl.fuse_animation() == {"FINISHED"}
     assert (snapshot(scene), scene.frame_current) == before

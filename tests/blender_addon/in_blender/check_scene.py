@@ -15,8 +15,8 @@ def check_sentences(scene):
     assert "turn Stereoscopy off" in sentence(**{"render.use_multiview": True})
     assert "turn Freestyle off" in sentence(**{"render.use_freestyle": True})
     assert "101x9 is too small for x4" in sentence(**{"render.resolution_y": 18})
-    assert "nowhere#1 does not exist" in sentence(**{"msspl.output": "//nowhere#1/fused_#.exr"})
-    assert "name it .exr" in sentence(**{"msspl.output": "//fused.png"})
+    assert "nowhere#1 does not exist" in sentence(**{"msspl.output": "//nowhere#1/{view_layer}_#.exr"})
+    assert "name it .exr" in sentence(**{"msspl.output": "//{view_layer}.png"})
     assert "exists; allow overwriting" in sentence(**{"render.use_overwrite": False})
     camera, scene.camera = scene.camera, None
     assert "has no camera" in sentence()
@@ -46,10 +46,15 @@ def check_sentences(scene):
 def check_samples():
     """Check that the LRHS gets the samples of the table in docs/guide/render.md, always more than the HRLS has."""
     options = module("options").Options
+    assert [(options(n, s).lrhs_spp, options(n, s).hrls_spp) for n, s in ((1, 1), (2, 1), (2, 4))] == [
+        (8, 8),
+        (4, 4),
+        (16, 1),
+    ]
     table = {1: (4, 16, 64), 3: (4, 16, 64), 4: (6, 22, 86), 6: (8, 32, 128), 8: (11, 43, 171)}
     for hr_spp, expected in table.items():
-        assert tuple(options(scale=scale, hr_spp=hr_spp).lrhs_spp for scale in (2, 4, 8)) == expected, hr_spp
-    assert all(options(scale=2, hr_spp=spp).lrhs_spp > spp for spp in range(1, 65))
+        assert tuple(options(renders=2, scale=scale, hr_spp=hr_spp).lrhs_spp for scale in (2, 4, 8)) == expected, hr_spp
+    assert all(options(renders=2, scale=2, hr_spp=spp).lrhs_spp > spp for spp in range(1, 65))
 
 
 def check_animated(scene):
@@ -70,10 +75,10 @@ def check_animated(scene):
 def check_changes(scene):
     """During a render, the user may change the frame, remove the scene or save the file in another window."""
     frame, overrides, failure = module("frame"), module("overrides"), module("errors").Failure
-    options = module("options").Options(view_layer="ViewLayer")
+    options = module("options").Options(renders=2, scale=4, view_layer="ViewLayer")
 
     def said(scene, meanwhile):
-        steps = frame.render_and_fuse(scene, options, WORK / "new.exr", WORK, fuse=None)
+        steps = frame.render_and_fuse(scene, options, WORK / "new.exr", WORK, None, frame.loaded_once(scene))
         next(steps)
         meanwhile()
         try:
@@ -123,7 +128,7 @@ def render_ramps():
     scene.camera.location.z = 2
     scene.collection.objects.link(scene.camera)
     scene.render.engine = "CYCLES"
-    options = module("options").Options(scale=8, hr_spp=64, lr_spp=256)
+    options = module("options").Options(renders=2, scale=8, hr_spp=64, lr_spp=256)
     for name, size, aspect in (
         ("wide", (205, 99), (1, 1)),
         ("tall", (99, 205), (1, 1)),

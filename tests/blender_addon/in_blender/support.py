@@ -43,7 +43,7 @@ def build_scene():
     layer.lightgroups.add(name="key")
     scene.view_layers.new("Other.1")
     bpy.context.window.view_layer = layer
-    scene.msspl.output = "//fused_###.exr"
+    scene.msspl.output, scene.msspl.renders = "//fused_{view_layer}_###.exr", "SIZES"
     bpy.ops.wm.save_as_mainfile(filepath=str(WORK / "scene.blend"))
     return scene
 

@@ -268,7 +268,9 @@ def _cell(row: results.Row, name: str) -> str:
 def _compare(folder: Path, spp: int, frame: str) -> None:
     """Write the page of pictures of a scene and filter, unless it is newer than all results."""
     page, renders = folder / f"{spp}spp.html", folder / f"{spp}spp"
-    images = sorted([*renders.glob(f"*/out{frame}.exr"), renders / f"full{frame}.exr", *renders.glob(f"hr{frame}.exr")])
+    # The page opens with the first two.
+    parts = ("best/out", "OIDN*/out", "balanced/out", "fast/out", "full", "hr")
+    images = [path for part in parts for path in sorted(renders.glob(f"{part}{frame}.exr"))]
     if page.exists() and page.stat().st_mtime > max(path.stat().st_mtime for path in images):
         return
     msspl = shutil.which("msspl", path=sysconfig.get_path("scripts")) or "msspl"

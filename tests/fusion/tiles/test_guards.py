@@ -151,3 +151,11 @@ def test_a_firefly_beside_a_lamp_is_dimmed_by_its_own_lrhs_pixel():
     lights = bright_lights(low, high, 1.0)
     assert (lights[8:10, 8:10] == 2 * LIGHT).all()
     assert (lights[8, 10] <= 0.5 * FIREFLY_FACTOR).all()
+
+
+def test_a_firefly_in_a_lamp_gets_no_more_than_the_lamp():
+    low, high = np.full((8, 8, 3), 0.5, np.float32), np.full((16, 16, 3), 0.5, np.float32)
+    low[4, 4], high[8:10, 8:10] = 2 * LIGHT, 2 * LIGHT
+    high[9, 9] = 1000 * LIGHT
+    lights = bright_lights(low, high, 1.0)
+    assert (lights[8:10, 8:10] == 2 * LIGHT).all()

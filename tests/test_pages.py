@@ -273,6 +273,27 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(file), f"{target}: no such heading"
 
 
+@pytest.mark.parametrize("link", ["nothing.md", "shots.md#no-such-heading", "../images/nothing.png"])
+def test_the_site_is_not_built_with_a_dead_link(link: str, tmp_path: Path) -> None:
+    """The command of `.ci/run` fails."""
+    pytest.importorskip("mkdocs")
+    (command,) = re.findall(r"^mkdocs .*", (ROOT / ".ci/run").read_text(encoding="utf-8"), re.MULTILINE)
+    for name in ("docs", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "mkdocs.yml"):
+        (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, tmp_path / name)
+    (tmp_path / "oiio_msspl").symlink_to(ROOT / "oiio_msspl")
+    with (tmp_path / "docs/guide/fuse.md").open("a", encoding="utf-8") as page:
+        page.write(f"\n[dead]({link})\n")
+    done = run(f"python -m {command.replace('$folder', str(tmp_path))}", tmp_path)
+    assert done.returncode == 1 and link in done.stderr, done.stderr
+
+
+def test_the_site_has_every_page() -> None:
+    """mkdocs refuses a page that its navigation lacks."""
+    listed = re.findall(r"- (?:Home: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    assert set(listed) == pages | {"index.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"}
+
+
 def test_every_public_name_is_on_the_page_about_python() -> None:
     page = (ROOT / "docs/api.md").read_text(encoding="utf-8")
     names = [line.rpartition(".") for line in re.findall(r"^::: (\S+)$", page, re.MULTILINE)]

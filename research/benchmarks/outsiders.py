@@ -6,17 +6,21 @@
 
 Mitsuba 3 renders the scenes of `research.benchmarks.render.own_scenes`. For n samples per pixel in all, a pair has an
 HRLS of n/2 spp and an LRHS of half its size with as many samples, and OIDN gets an ordinary render with n spp, or the
-HRLS alone. OIDN runs as its documentation recommends: high quality, albedo and normal prefiltered. Seconds are those of
-the whole command. A shot in which the camera moves is scored by its flicker, too.
+HRLS alone. With 1 spp there is one render, and both get it. OIDN runs as its documentation recommends: high quality,
+albedo and normal prefiltered. Seconds are those of the whole command. A shot in which the camera moves is scored by its
+flicker and its motion error, too: see `research.benchmarks.shots.measures`.
 
-OUT gets the renders, the results, ``table.csv``, and ``index.html`` with a page of pictures for each scene. A run that
-was stopped continues. ``--oidn`` names a Python with another pyoidn, NumPy and OpenEXR.
+OUT gets the renders, the results, ``table.csv``, and ``index.html`` with a page of pictures for each scene, in a folder
+``quick`` or ``full``. A run that was stopped continues. ``--oidn`` names a Python with another pyoidn, NumPy and
+OpenEXR; its rows join those of the first one.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import html
+import itertools
 import shutil
 import subprocess
 import sys
@@ -39,16 +43,18 @@ from research.benchmarks import oidn, results
 from research.benchmarks.accuracy import mean_flip
 from research.benchmarks.render.film import write_exr
 from research.benchmarks.render.own_scenes import GROUPS, SCENES, lamps
-from research.benchmarks.shots.measures import flicker
+from research.benchmarks.shots.measures import flicker, motion_error
 from research.datagen.mitsuba.start import start as start_mitsuba
 
 LAYERS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z")
 MOTION = ("motionFore.X", "motionFore.Y")
 QUALITIES = ("fast", "balanced", "best")
-#: Methods that denoise one render: its file in the folder of a pair.
-OIDN = {"OIDN on the HRLS": "hr", "OIDN at full resolution": "full"}
+#: What OIDN denoises: its file in the folder of a pair.
+OIDN = {"on the HRLS": "hr", "at full resolution": "full"}
 #: Columns that tell rows apart.
 KEYS = ("scene", "filter", "spp", "method")
+#: Columns with a measurement, and how the page shows them.
+SCORES = {"psnr": ".2f", "relmse": ".4f", "flip": ".4f", "flicker": ".4f", "motion_error": ".4f", "seconds": ".1f"}
 SCALE = 2
 SHOT = "shot"
 #: Degrees that the camera of the shot turns from frame to frame, and its horizontal field of view.
@@ -67,13 +73,13 @@ class Extent:
     scenes: tuple[str, ...]
     filters: tuple[str, ...]
     spp: tuple[int, ...]
-    """Samples per pixel in all: an even number."""
+    """Samples per pixel in all: 1, or an even number."""
     frames: int
     reference: int
     """Samples per pixel of the references."""
 
 
-FULL = Extent((640, 384), tuple(SCENES), ("box", "gaussian"), (2, 8, 32, 128, 256), 12, 8192)
+FULL = Extent((640, 384), tuple(SCENES), ("box", "gaussian"), (1, 2, 8, 32, 128, 256), 12, 8192)
 QUICK = Extent((192, 128), ("room", "glass", "hair", "lamps", "stars"), ("box",), (2, 8), 3, 256)
 
 
@@ -148,14 +154,15 @@ def _camera(at: float) -> NDArray[Any]:
 
 
 def render(renderer: Renderer, extent: Extent, folder: Path, name: str, pixel_filter: str) -> None:
-    """Render the files of a scene that do not exist yet: ``ref``, and ``lr``, ``hr`` and ``full`` for each spp."""
+    """Render the files of a scene that do not exist yet: ``ref``, and ``full``, ``lr`` and ``hr`` for each spp."""
     frames: Sequence[int | None] = range(1, extent.frames + 1) if name == SHOT else [None]
     for frame in frames:
         jobs = [(folder / f"ref{_number(frame)}", 1, extent.reference)]
         for spp in extent.spp:
-            pair = folder / f"{spp}spp"
-            jobs += [(pair / f"lr{_number(frame)}", SCALE, SCALE**2 * spp // 2)]
-            jobs += [(pair / f"hr{_number(frame)}", 1, spp // 2), (pair / f"full{_number(frame)}", 1, spp)]
+            parts = [("full", 1, spp)]
+            if spp > 1:
+                parts += [("lr", SCALE, SCALE**2 * spp // 2), ("hr", 1, spp // 2)]
+            jobs += [(folder / f"{spp}spp/{part}{_number(frame)}", scale, count) for part, scale, count in parts]
         for path, scale, count in jobs:
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -167,45 +174,55 @@ def _number(frame: int | None) -> str:
     return ".exr" if frame is None else f".{frame:04}.exr"
 
 
-def measure(
-    folder: Path, name: str, spp: int, done: set[Any], key: tuple[Any, ...], python: str
-) -> Iterator[results.Row]:
+def measure(folder: Path, done: set[Any], key: tuple[str, str, int], python: str) -> Iterator[results.Row]:
     """Run every method on the renders of a scene that has no row yet, and yield its row.
 
     Args:
         folder: of the scene and filter.
-        name, spp: the scene, and samples per pixel in all.
         done: keys of the rows that exist.
-        key: scene, filter and spp.
+        key: scene, filter and samples per pixel in all.
         python: the Python that runs OIDN.
     """
-    pair, is_shot = folder / f"{spp}spp", name == SHOT
+    scene, _, spp = key
+    renders, is_shot = folder / f"{spp}spp", scene == SHOT
     fuse = shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or "msspl-fuse"
-    inputs = [str(pair / f"{part}{'.####' if is_shot else ''}.exr") for part in ("lr", "hr")]
-    for method in (*QUALITIES, *OIDN):
+    parts = ("full",) if spp == 1 else ("lr", "hr")
+    inputs = [str(renders / f"{part}{'.####' if is_shot else ''}.exr") for part in parts]
+    oidn_methods = {
+        f"OIDN {oidn_version(python)} {name}": part for name, part in OIDN.items() if part in (*parts, "full")
+    }
+    for method in (*QUALITIES, *oidn_methods):
         if (*key, method) in done:
             continue
-        target = pair / method.replace(" ", "_")
+        target = renders / method.replace(" ", "_")
         target.mkdir(exist_ok=True)
-        out = str(target / ("out.####.exr" if is_shot else "out.exr"))
         start = time.perf_counter()
         if method in QUALITIES:
+            out = str(target / ("out.####.exr" if is_shot else "out.exr"))
             _run([fuse, *inputs, "-o", out, "--quality", method, "--overwrite", "--no-preview"])
         else:
-            for source in sorted(pair.glob(f"{OIDN[method]}.*exr")):
-                _run([python, oidn.__file__, str(source), str(target / source.name.replace(OIDN[method], "out", 1))])
+            part = oidn_methods[method]
+            for source in sorted(renders.glob(f"{part}.*exr")):
+                _run([python, oidn.__file__, str(source), str(target / source.name.replace(part, "out", 1))])
         seconds = time.perf_counter() - start
         yield dict(zip(KEYS, (*key, method), strict=True)) | _scores(folder, target) | {"seconds": round(seconds, 2)}
 
 
-def _run(command: Sequence[str]) -> None:
+@functools.cache
+def oidn_version(python: str) -> str:
+    """Return the version of the pyoidn that a Python has."""
+    return _run([python, "-c", "import importlib.metadata as m; print(m.version('pyoidn'))"]).strip()
+
+
+def _run(command: Sequence[str]) -> str:
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)}\n{done.stderr[-2000:]}")
+    return done.stdout
 
 
 def _scores(folder: Path, target: Path) -> dict[str, float]:
-    """Return the mean scores of the results in a folder, and their flicker if they are a shot."""
+    """Return the mean scores of the results in a folder; for a shot also how it differs from frame to frame."""
     references = [_pixels(path) for path in sorted(folder.glob("ref*.exr"))]
     images = [_pixels(path) for path in sorted(target.glob("out*.exr"))]
     rows = [
@@ -214,8 +231,8 @@ def _scores(folder: Path, target: Path) -> dict[str, float]:
     ]
     means = {name: float(np.mean([row[name] for row in rows])) for name in ("psnr", "relmse", "flip")}
     if len(images) > 1:
-        truth = srgb(np.stack(references))
-        means["flicker"] = flicker(srgb(np.stack(images)), (truth, truth))
+        shown, truth = srgb(np.stack(images)), srgb(np.stack(references))
+        means |= {"flicker": flicker(shown, (truth, truth)), "motion_error": motion_error(shown, truth)}
     return means
 
 
@@ -225,31 +242,39 @@ def _pixels(path: Path) -> Image:
 
 def write_pages(out: Path, rows: Sequence[results.Row]) -> None:
     """Write a page of pictures for each scene, by ``msspl compare``, and ``index.html`` with the table."""
-    msspl = shutil.which("msspl", path=sysconfig.get_path("scripts")) or "msspl"
-    cells = [
-        "".join(f"<th>{html.escape(name)}</th>" for name in (*KEYS, "psnr", "relmse", "flip", "flicker", "seconds"))
-    ]
-    for row in rows:
-        folder = out / row["scene"] / row["filter"]
-        page = folder / f"{row['spp']}spp.html"
-        if not page.exists():
-            frame = "" if row["scene"] != SHOT else ".0001"
-            images = [*folder.glob(f"{row['spp']}spp/*/out{frame}.exr"), folder / f"{row['spp']}spp/hr{frame}.exr"]
-            reference = str(folder / f"ref{frame}.exr")
-            _run([msspl, "compare", *map(str, sorted(images)), "--reference", reference, "--html", str(page)])
-        link = f'<a href="{page.relative_to(out).as_posix()}">{row["scene"]}</a>'
-        texts = [link, *(html.escape(f"{row[key]}") for key in KEYS[1:])]
-        forms = {"psnr": ".2f", "relmse": ".4f", "flip": ".4f", "flicker": ".4f", "seconds": ".1f"}
-        texts += [f"{row[name]:{form}}" if name in row else "" for name, form in forms.items()]
-        cells.append("".join(f"<td>{text}</td>" for text in texts))
+    titles = (*KEYS, *SCORES)
+    lines = [[f"<th>{name.replace('_', ' ')}</th>" for name in titles]]
+    for (scene, kind, spp), group in itertools.groupby(rows, lambda row: tuple(row[key] for key in KEYS[:3])):
+        page = f"{scene}/{kind}/{spp}spp.html"
+        _compare(out / scene / kind, int(spp), ".0001" if scene == SHOT else "")
+        for row in group:
+            link = f'<a href="{page}">{scene}</a>'
+            lines.append([f"<td>{link}</td>", *(f"<td>{html.escape(_cell(row, name))}</td>" for name in titles[1:])])
     style = "body{font:15px sans-serif;margin:2em}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #ccc}"
-    table = "".join(f"<tr>{row}</tr>\n" for row in cells)
+    table = "".join(f"<tr>{''.join(line)}</tr>\n" for line in lines)
     (out / "index.html").write_text(
         f"<!doctype html><meta charset=utf-8><title>Pairs and OIDN</title><style>{style}</style>\n"
-        f"<h1>Pairs and OIDN</h1><p>spp: samples per pixel in all. PSNR is better if higher, all others if lower.</p>\n"
+        "<h1>Pairs and OIDN</h1><p>spp: samples per pixel in all. PSNR is in dB, and better if higher. All others are "
+        "better if lower; motion error is in pixels. A scene's name leads to its pictures.</p>\n"
         f"<table>\n{table}</table>\n",
         encoding="utf-8",
     )
+
+
+def _cell(row: results.Row, name: str) -> str:
+    return f"{row[name]:{SCORES.get(name, '')}}" if name in row else ""
+
+
+def _compare(folder: Path, spp: int, frame: str) -> None:
+    """Write the page of pictures of a scene and filter, unless it is newer than all results."""
+    page, renders = folder / f"{spp}spp.html", folder / f"{spp}spp"
+    # The page opens with the first two.
+    parts = ("best/out", "OIDN*/out", "balanced/out", "fast/out", "full", "hr")
+    images = [path for part in parts for path in sorted(renders.glob(f"{part}{frame}.exr"))]
+    if page.exists() and page.stat().st_mtime > max(path.stat().st_mtime for path in images):
+        return
+    msspl = shutil.which("msspl", path=sysconfig.get_path("scripts")) or "msspl"
+    _run([msspl, "compare", *map(str, images), "--reference", str(folder / f"ref{frame}.exr"), "--html", str(page)])
 
 
 def main() -> None:
@@ -260,7 +285,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=0, help="of Mitsuba; 0: one a core")
     args = parser.parse_args()
     extent = QUICK if args.quick else FULL
-    out, table = args.out.resolve(), args.out.resolve() / "table.csv"
+    out = args.out.resolve() / ("quick" if args.quick else "full")
+    table = out / "table.csv"
     mi = start_mitsuba(args.threads or available_cores())
     renderer = Renderer(mi, extent.size)
     rows = results.read(table) if table.exists() else []
@@ -271,12 +297,13 @@ def main() -> None:
         render(renderer, extent, folder, name, kind)
         for spp in extent.spp:
             done = {tuple(row[key] for key in KEYS) for row in rows}
-            for row in measure(folder, name, spp, done, (name, kind, spp), args.oidn):
+            for row in measure(folder, done, (name, kind, spp), args.oidn):
                 rows.append(row)
                 results.write(table, rows)
+    order = {job: position for position, job in enumerate(jobs)}
+    rows.sort(key=lambda row: (order[row["scene"], row["filter"]], row["spp"]))
     write_pages(out, rows)
-    for row in rows:
-        print("  ".join(f"{row[key]}" for key in (*KEYS, "psnr", "relmse", "flip", "flicker", "seconds") if key in row))
+    print(results.markdown((*KEYS, *SCORES), [[_cell(row, name) for name in (*KEYS, *SCORES)] for row in rows]))
     print(out / "index.html")
 
 

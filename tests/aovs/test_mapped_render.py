@@ -38,6 +38,13 @@ def test_a_luminance_variance_is_taken_as_it_is(tmp_path):
     assert render.read(render.data_window)["variance"][0, 0, 0] == 0.25
 
 
+def test_a_relative_luminance_variance_is_relative_to_the_luminance(tmp_path):
+    channels = {"R": plane(1), "G": plane(0.5), "B": plane(0.25), "v.Y": plane(0.64)}
+    render = mapped(tmp_path, channels, {"variance": {"layer": "v", "kind": "relative"}}, spp=4)
+    expected = 0.64 * (0.2126 + 0.7152 * 0.5 + 0.0722 * 0.25) / 4
+    np.testing.assert_allclose(render.read(render.data_window)["variance"], expected, rtol=1e-5)
+
+
 @needs_shared("exr")
 def test_cycles_layers_add_up_to_the_beauty():
     """The paper's equations: diffuse + gloss + transmission + emission + environment is the beauty."""

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from oiio_msspl.aovs import motion
-from oiio_msspl.aovs.motion import MOST_GUESSES, MotionFormat, find_motion_layers
+from oiio_msspl.aovs.motion import MOST_GUESSES, MotionFormat, find_motion_layers, read_format
 from oiio_msspl.aovs.renderers import renderers, view_layer_of
 from oiio_msspl.aovs.views import Beauty
+from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import Channel, open_exr
 from tests.aovs.renders import H, W, layer, mapped
@@ -77,3 +78,31 @@ def test_the_work_grows_with_the_number_of_layers_and_not_with_its_square(monkey
     monkeypatch.setattr(motion, "view_layer_of", lambda *names: calls.append(names) or view_layer_of(*names))
     find_motion_layers(renderers()[-1], lamps, Beauty("", "", Layer("", "")))
     assert 0 < len(calls) < 100 * len(lamps)
+
+
+@pytest.mark.parametrize(
+    ("unit", "pixels"), [("pixels", (1, 1)), ("ndc", (200, 100)), ("screen", (100, 50)), ("width", (200, 200))]
+)
+def test_a_vector_of_1_is_that_many_pixels(unit, pixels):
+    """On a screen from -1 to 1, a vector of 1 crosses half of the frame."""
+    assert MotionFormat(unit=unit, x="right", y="down").pixels_per_unit(200, 100) == pixels
+    x, y = pixels
+    assert MotionFormat(unit=unit, x="left", y="up", scale=2).pixels_per_unit(200, 100) == (-2 * x, -2 * y)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("layer=v,scale=0", "scale is a number, but not 0"),
+        ("layer=v,offset=nan", "offset is a number"),
+        ("layer=v,channels=X", "channels are two letters"),
+        ("layer=v,premultiplied=1", "premultiplied stands alone"),
+        ("layer=v,to=next,to=next", "to is given twice"),
+        ("layer=v,speed=1", "'speed' is none of layer, channels, to"),
+        ("to=next", "starts with layer=NAME"),
+    ],
+)
+def test_a_format_that_can_t_be_read_is_explained(text, problem):
+    assert read_format("layer=v,offset=0,scale=2+layer=w") == [{"layer": "v", "offset": 0, "scale": 2}, {"layer": "w"}]
+    with pytest.raises(InputError, match=problem):
+        read_format(text)

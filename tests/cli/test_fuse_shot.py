@@ -41,6 +41,7 @@ from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot
         (["lr", "hr", "-o", "out", "--report", "no/r.json"], "does not exist; create it first"),
         (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
         (["lr", "hr", "-o", "out", "--ocio-view", "x"], "--ocio-view 'x'"),
+        (["lr", "hr", "-o", "out", "--motion-format", "layer=v,to=x"], "layer=v,to=x': to is next or previous"),
         (["lr", "hr", "-o", "out", "--model", "paper", "--error-layer"], "paper-x4 does not predict its error"),
         (["lr/lr.1001.exr", "hr/beauty.1001.exr", "-o", "o.exr", "--skip-existing"], "--skip-existing is for shots"),
     ],

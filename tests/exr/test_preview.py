@@ -45,6 +45,12 @@ def test_every_value_is_at_most_one_step_from_the_curve(tmp_path):
     assert abs(steps).max() <= 1 and np.count_nonzero(steps) < 0.02 * steps.size
 
 
+def test_light_beyond_half_floats_is_white_and_what_is_no_number_is_black(tmp_path):
+    rgb = np.array([[[1e30, np.inf, 65504], [-1e30, -np.inf, np.nan]]], np.float32)
+    write_preview(tmp_path / "a.png", rgb, Window(0, 0, 2, 1), Window(0, 0, 2, 1))
+    assert png(tmp_path / "a.png").tolist() == [[[255] * 3, [0] * 3]]
+
+
 def test_display_values_are_written_as_they_are_and_clipped(tmp_path):
     values = np.array([[[-1, 0, 0.5], [1, 2, 0.25]]], np.float32)
     write_png(tmp_path / "a.png", values)

@@ -32,6 +32,15 @@ def test_outside_the_data_window_is_zero(tmp_path):
     assert pixels[2:10, 2:10].any()
 
 
+def test_where_parts_differ_the_first_one_names_the_metadata(tmp_path):
+    """Otherwise they hold together."""
+    parts = [
+        (name, rgb(picture(4, 4)), (0, 0), own) for name, own in (("a", {"who": "a"}), ("b", {"who": "b", "at": "b"}))
+    ]
+    metadata = open_exr(write_exr(tmp_path / "a.exr", parts)).metadata
+    assert (metadata["who"], metadata["at"]) == ("a", "b")
+
+
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_every_compression_is_read(tmp_path, compression):
     image = picture(70, 33).astype(np.float16)

@@ -9,6 +9,7 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.tiles import tiling
+from oiio_msspl.fusion.tiles.alpha import INVISIBLE
 from oiio_msspl.fusion.tiles.guards import SMEAR
 from oiio_msspl.image.filters import grown
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
@@ -455,8 +456,11 @@ def test_alpha_is_exact_only_if_the_pixels_around_agree(bilinear_models):
     assert (fuse(low, high, session).alpha == coverage).all()
     low.layers["alpha"][:, 15], low.layers["alpha"][:, 16] = 0.2, 0.8
     alpha = fuse(low, high, session).alpha[40, :, 0]
-    assert 0 < alpha[63] < alpha[64] < 1
+    assert 0 < alpha[59] < alpha[63] < alpha[64] < alpha[68] < 1
     assert (alpha[: 60 - SMEAR] == 0).all() and (alpha[68 + SMEAR :] == 1).all()
+    low.layers["alpha"][:, 15], low.layers["alpha"][:, 16] = 0.005, 0.995
+    alpha = fuse(low, high, session).alpha[40, :, 0]
+    assert 0 < alpha[59] < INVISIBLE and 1 - INVISIBLE < alpha[68] < 1
 
 
 def test_a_surface_is_solid_up_to_its_edge(scale):

@@ -110,6 +110,8 @@ def test_spaces_whose_headers_were_rounded_are_the_same():
     own = (0.7, 0.3, 0.2, 0.7, 0.1, 0.05, 0.3127, 0.329)
     one, other = (space_of({"chromaticities": tuple(v + delta for v in own)}) for delta in (0, 1e-6))
     assert one != other and same_space(one, other) and not same_space(one, ACESCG)
+    moved = space_of({"chromaticities": (own[0] - 0.01, *own[1:])})
+    assert not same_space(one, moved)
 
 
 def test_luminance_weighs_red_green_and_blue_as_rec_709_does():

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from oiio_msspl.image.filters import box_downsample, filled, means_around
+from oiio_msspl.image.filters import all_within, box_downsample, filled, grown, means_around, upsample_linear
 
 
 @pytest.mark.parametrize("size", [(40, 27), (9, 5), (1, 30)])
@@ -56,3 +56,22 @@ def test_without_any_known_pixel_nothing_is_filled():
     image = np.zeros((5, 7, 3), np.float32)
     assert filled(image, np.ones((5, 7), bool)) is image
     assert filled(image, np.zeros((5, 7), bool)) is image
+
+
+@pytest.mark.parametrize("reach", [0, 1, 2, 8, 15])
+def test_masks_shrink_and_grow_as_far_as_asked(reach):
+    mask = np.zeros((40, 50), bool)
+    mask[20, 25] = True
+    y, x = np.ogrid[:40, :50]
+    near = (abs(y - 20) <= reach) & (abs(x - 25) <= reach)
+    np.testing.assert_array_equal(grown(mask, reach), near)
+    np.testing.assert_array_equal(all_within(~mask, reach), ~near)
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_an_enlarged_ramp_is_the_ramp_at_the_middles_of_its_pixels(scale):
+    y, x = np.mgrid[:12, :9].astype(np.float32)
+    large = upsample_linear(3 * y + 5 * x, scale, slice(2, 10))
+    y, x = ((np.arange(n * scale) + 0.5) / scale - 0.5 for n in (8, 9))
+    inside = (x >= 0) & (x <= 8)
+    np.testing.assert_allclose(large[:, inside], (3 * (2 + y)[:, None] + 5 * x)[:, inside], rtol=1e-5)

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import SimpleNamespace
@@ -20,8 +21,9 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.jobs import memory, pipeline, shot, shot_report, write
+from oiio_msspl.jobs import existing, memory, pipeline, shot, shot_report, write
 from oiio_msspl.jobs import run as run_module
+from oiio_msspl.jobs.existing import CLOCK_SKEW
 from oiio_msspl.jobs.plan import TemporalOptions
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.shot_report import fused_result, read_earlier
@@ -446,7 +448,7 @@ def test_another_model_or_scale_than_that_of_the_first_frame_is_a_warning(tmp_pa
     assert other_scale == "the scale is x2 here and x4 in frame 1001: it may flicker"
 
 
-def test_a_shot_is_not_resumed_with_other_weights(tmp_path, bilinear_models):
+def test_a_shot_is_not_resumed_with_other_weights(tmp_path, bilinear_models, monkeypatch):
     """Frames without a digest, and files that are no EXR, do not stop it."""
     folder = make_shot(tmp_path, 4)
     run(folder, bilinear_models[4], frames="1001")
@@ -455,6 +457,9 @@ def test_a_shot_is_not_resumed_with_other_weights(tmp_path, bilinear_models):
     before = contents(folder / "out")
     with pytest.raises(InputError, match=r"beauty.1001.exr: was fused by other weights \(bilinear-x4 \w{12}\) than"):
         run(folder, "fast", skip_existing=True)
+    with monkeypatch.context() as patch, pytest.raises(InputError, match=r"would be \(bilinear-x4 0{12}\)"):
+        patch.setattr(existing, "digests", lambda models, device: {path.stem: "0" * 12 for path in models})
+        run(folder, bilinear_models[4], skip_existing=True)
     assert contents(folder / "out") == before
     assert run(folder, bilinear_models[4], skip_existing=True).results[1004].status == "fused"
     assert run(folder, "fast", overwrite=True).exit_code == 0
@@ -763,6 +768,8 @@ def test_frames_that_are_older_than_an_input_are_named_and_with_update_fused_aga
     more = {"inputs": InputOptions({"albedo": f"file:{albedo}"}), "previews": True}
     assert run(folder, bilinear_models[4], **more).exit_code == 0
     outputs = {n: folder / f"out/beauty.{n}.exr" for n in range(1001, 1005)}
+    written = outputs[1001].stat().st_mtime_ns
+    os.utime(folder / "lr/lr.1001.exr", ns=(written, written))  # of the same moment, so not newer
     now = outputs[1004].stat().st_mtime
     os.utime(folder / "lr/lr.1002.exr", (now + 9, now + 9))
     os.utime(folder / "hr/beauty.1003.exr", (now + 9, now + 9))
@@ -856,6 +863,9 @@ def test_update_says_that_a_date_lies_in_the_future(tmp_path, bilinear_models, c
     run(folder, bilinear_models[4], update=True)
     assert "future" not in caplog.text
     late = folder / "hr/beauty.1002.exr"
+    os.utime(late, (time.time() + CLOCK_SKEW - 20,) * 2)  # another machine's clock
+    run(folder, bilinear_models[4], update=True)
+    assert "future" not in caplog.text
     os.utime(late, (late.stat().st_mtime + 5000,) * 2)
     run(folder, bilinear_models[4], update=True)
     assert f"{late}: is dated in the future, so --update can't tell what is newer" in caplog.text

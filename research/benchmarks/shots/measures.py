@@ -4,12 +4,16 @@
 Flicker is what changes from frame to frame of a result beyond what changes in the reference. With the result O and the
 reference R, it is the root of the mean square of (O[t+1] - O[t]) - (R[t+1] - R[t]), in sRGB values from 0 to 1.
 
+Motion error is the measure tOF of Chu et al. 2020, "Learning Temporal Coherence via Self-Supervision for GAN-based
+Video Generation": how far the optical flow of a result lies from that of the reference, in pixels.
+
 The reference comes in two halves with independent noise. Each square is the product of the differences to both halves,
 so that the noise of the reference cancels out.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -26,6 +30,19 @@ def flicker(images: Array, truth: tuple[Array, Array]) -> float:
     """Return the flicker of sRGB images (frames, h, w, 3) against two references, or twice one without noise."""
     first, second = (np.diff(images - reference, axis=0) for reference in truth)
     return math.sqrt(_mean(first * second))
+
+
+def motion_error(images: Array, truth: Array) -> float:
+    """Return the mean distance in pixels of the optical flows of sRGB images (frames, h, w, 3) and their reference."""
+    import cv2
+
+    def flows(frames: Array) -> Array:
+        grey = [cv2.cvtColor(np.round(255 * frame).astype(np.uint8), cv2.COLOR_RGB2GRAY) for frame in frames]
+        start = np.zeros((*grey[0].shape, 2), np.float32)
+        pairs = itertools.pairwise(grey)
+        return np.stack([cv2.calcOpticalFlowFarneback(*pair, start, 0.5, 3, 15, 3, 5, 1.2, 0) for pair in pairs])
+
+    return float(np.linalg.norm(flows(images) - flows(truth), axis=-1).mean())
 
 
 def psnr(image: Array, truth: tuple[Array, Array], mask: Mask | None = None) -> float:

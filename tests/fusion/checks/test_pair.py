@@ -7,6 +7,7 @@ import pytest
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.checks.averages import HrlsAverages
+from oiio_msspl.fusion.checks.colours import different_colours
 from oiio_msspl.fusion.checks.framing import Framing, central_area, find_framing
 from oiio_msspl.fusion.checks.pair import check_renders
 from oiio_msspl.fusion.tiles.alignment import align
@@ -248,6 +249,14 @@ def test_values_encoded_for_a_display_are_noticed(scale):
     low, high = (0.3 * render.layers["rgb"] for render in pair(scale))
     said = warnings(scale, lr=srgb(low), rgb=high)
     assert any("the LRHS looks encoded for a display" in text for text in said)
+
+
+def test_a_few_blocks_full_of_coloured_noise_do_not_hide_swapped_channels():
+    high = np.random.default_rng(0).uniform(0.4, 0.6, (80, 3))
+    low = high[:, ::-1].copy()
+    low[:20], high[:20] = (0.01, 1, 0.01), (1, 0.01, 0.01)
+    assert different_colours(low, high) == "red and blue are swapped in one of the two renders"
+    assert different_colours(low, low) is None
 
 
 def test_swapped_channels_are_noticed(scale):

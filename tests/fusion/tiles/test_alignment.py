@@ -61,6 +61,7 @@ def test_display_windows_may_begin_anywhere():
         (render("lr.exr", 16, 9), render("hr.exr", 32, 32), "framing differs: the ratio is 2 in width and 3.56"),
         (render("lr.exr", 16, 16), render("hr.exr", 32, 32, aspect=2), "pixel aspect 1, hr.exr has 2"),
         (render("lr.exr", 16, 16), render("hr.exr", 32, 32, Window(-8, 0, 32, 32)), "covers only 16x16"),
+        (render("lr.exr", 16, 16), render("hr.exr", 32, 32, Window(-4, 0, 32, 32)), "covers only 16x16"),
     ],
 )
 def test_what_does_not_fit_is_explained(low, high, message):

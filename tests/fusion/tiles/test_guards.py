@@ -10,6 +10,7 @@ from oiio_msspl.fusion.tiles.features import TileFeatures
 from oiio_msspl.fusion.tiles.guards import (
     FIREFLY_FACTOR,
     LIGHT,
+    SMEAR,
     EmptyRegions,
     _rare_light,
     bright_lights,
@@ -151,3 +152,22 @@ def test_a_firefly_beside_a_lamp_is_dimmed_by_its_own_lrhs_pixel():
     lights = bright_lights(low, high, 1.0)
     assert (lights[8:10, 8:10] == 2 * LIGHT).all()
     assert (lights[8, 10] <= 0.5 * FIREFLY_FACTOR).all()
+
+
+def test_a_firefly_in_a_lamp_gets_no_more_than_the_lamp():
+    low, high = np.full((8, 8, 3), 0.5, np.float32), np.full((16, 16, 3), 0.5, np.float32)
+    low[4, 4], high[8:10, 8:10] = 2 * LIGHT, 2 * LIGHT
+    high[9, 9] = 1000 * LIGHT
+    lights = bright_lights(low, high, 1.0)
+    assert (lights[8:10, 8:10] == 2 * LIGHT).all()
+
+
+def test_the_pixels_around_a_surface_are_not_empty_where_light_is_near():
+    """A smear of motion blur has empty samples between those that hit it."""
+    low, high = np.zeros((16, 16, 3), np.float32), np.zeros((32, 32, 3), np.float32)
+    low[0, 0], high[:2, :2] = 1, 1
+    alpha = np.zeros((32, 32, 1), np.float32)
+    alpha[16, 16] = 1
+    empty = EmptyRegions(low).mask(tile(low, {RGB: high, "alpha": alpha}), (slice(0, 16), slice(0, 16)))[..., 0]
+    near = np.s_[16 - SMEAR : 17 + SMEAR]
+    assert not empty[near, near].any() and empty[17 + SMEAR :].all()

@@ -9,6 +9,7 @@ import pytest
 from research.benchmarks import outsiders
 from research.benchmarks.outsiders import MOTION, Extent, Renderer
 from research.benchmarks.render.film import write_exr
+from research.benchmarks.shots.measures import blur, motion_error
 from tests.conftest import noisy, picture
 
 RGB = ("R", "G", "B")
@@ -35,13 +36,71 @@ def test_a_shot_has_the_flicker_of_its_frames(tmp_path):
     steady, rough = (outsiders._scores(tmp_path, tmp_path / name) for name in ("steady", "noisy"))
     assert steady["flicker"] == 0 and steady["relmse"] == 0 and steady["flip"] == pytest.approx(0, abs=1e-4)
     assert rough["flicker"] > 0.01 and rough["psnr"] < 40
+    assert steady["motion_error"] == 0 and rough["motion_error"] > 0.01
+
+
+def test_motion_error_is_the_distance_of_the_motions_in_pixels():
+    rng = np.random.default_rng(0)
+    wall = np.repeat(blur(rng.random((1, 96, 160, 1), np.float32), 2.0), 3, axis=-1)[0]
+    wall = (wall - wall.min()) / np.ptp(wall)
+    still, slow, fast = (np.stack([wall[:, step * at : step * at + 120] for at in range(4)]) for step in (0, 1, 3))
+    assert motion_error(slow, slow) == 0
+    assert motion_error(slow, still) == pytest.approx(1, abs=0.1)
+    assert motion_error(fast, slow) == pytest.approx(2, abs=0.2)
 
 
 def test_what_is_measured_is_not_measured_again(tmp_path, monkeypatch):
     monkeypatch.setattr(outsiders, "_run", lambda command: pytest.fail(f"ran {command}"))
+    monkeypatch.setattr(outsiders, "oidn_version", lambda python: "2.5.1")
     key = ("room", "box", 2)
-    done = {(*key, method) for method in (*outsiders.QUALITIES, *outsiders.OIDN)}
-    assert list(outsiders.measure(tmp_path, "room", 2, done, key, sys.executable)) == []
+    done = {(*key, method) for method in (*outsiders.QUALITIES, *(f"OIDN 2.5.1 {name}" for name in outsiders.OIDN))}
+    assert list(outsiders.measure(tmp_path, done, key, sys.executable)) == []
+
+
+def test_another_oidn_has_rows_of_its_own_and_one_render_is_fused_alone(tmp_path, monkeypatch):
+    commands = []
+
+    def run(command):
+        commands.append(command)
+        return "3.0.0\n"
+
+    monkeypatch.setattr(outsiders, "_run", run)
+    monkeypatch.setattr(outsiders, "_scores", lambda folder, target: {"psnr": 30.0})
+    (tmp_path / "1spp").mkdir()
+    (tmp_path / "1spp/full.exr").touch()
+    key = ("room", "box", 1)
+    done = {(*key, method) for method in ("fast", "balanced", "OIDN 2.5.1 at full resolution")}
+    rows = list(outsiders.measure(tmp_path, done, key, "other/python"))
+    assert [row["method"] for row in rows] == ["best", "OIDN 3.0.0 at full resolution"]
+    (_, fuse, denoise) = commands
+    assert [word for word in fuse if word.endswith("spp/full.exr")] == [fuse[1]] and fuse[2] == "-o"
+    assert denoise[0] == "other/python" and denoise[2:] == [
+        str(tmp_path / "1spp/full.exr"),
+        str(tmp_path / "1spp/OIDN_3.0.0_at_full_resolution/out.exr"),
+    ]
+
+
+def test_the_page_has_a_row_for_each_measurement_and_links_to_the_pictures(tmp_path, monkeypatch):
+    compared = []
+    monkeypatch.setattr(outsiders, "_run", lambda command: compared.append(command) or "")
+    rows = [
+        {"scene": scene, "filter": "box", "spp": spp, "method": method, "psnr": 30.126, "relmse": 0.5, "flip": 0.1}
+        for scene, spp in (("room", 1), ("room", 2), ("shot", 2))
+        for method in ("best", "OIDN <3>")
+    ]
+    for row in rows:
+        frame = ".0001" if row["scene"] == "shot" else ""
+        folder = tmp_path / row["scene"] / "box" / f"{row['spp']}spp"
+        (folder / "best").mkdir(parents=True, exist_ok=True)
+        write_exr(folder / f"best/out{frame}.exr", np.zeros((4, 4, 3)), RGB)
+        write_exr(folder / f"full{frame}.exr", np.zeros((4, 4, 3)), RGB)
+    outsiders.write_pages(tmp_path, rows)
+    page = (tmp_path / "index.html").read_text()
+    assert page.count("<tr>") == 1 + len(rows) and page.count("30.13") == len(rows) and "OIDN &lt;3&gt;" in page
+    assert [command[-1] for command in compared] == [
+        str(tmp_path / name) for name in ("room/box/1spp.html", "room/box/2spp.html", "shot/box/2spp.html")
+    ]
+    assert all(f'href="{name}"' in page for name in ("room/box/1spp.html", "shot/box/2spp.html"))
 
 
 def test_files_that_exist_are_not_rendered_again(tmp_path):
@@ -54,17 +113,15 @@ def test_files_that_exist_are_not_rendered_again(tmp_path):
             return dict.fromkeys(RGB, np.zeros((8, 8), np.float32))
 
     first, second = Counting(), Counting()
-    extent = Extent((8, 8), ("room",), ("box",), (2, 8), 1, 64)
+    extent = Extent((8, 8), ("room",), ("box",), (1, 2, 8), 1, 64)
     for renderer in (first, second):
         outsiders.render(renderer, extent, tmp_path, "room", "box")
     assert [(scale, spp) for _, _, scale, spp, *_ in first.jobs] == [
-        (1, 64),
-        *((2, 4), (1, 1), (1, 2)),
-        (2, 16),
-        (1, 4),
-        (1, 8),
+        *((1, 64), (1, 1)),
+        *((1, 2), (2, 4), (1, 1)),
+        *((1, 8), (2, 16), (1, 4)),
     ]
-    assert len({seed for *_, seed, _ in first.jobs}) == 7 and not second.jobs
+    assert len({seed for *_, seed, _ in first.jobs}) == 8 and not second.jobs
 
 
 def test_mitsuba_renders_light_groups_that_sum_to_the_beauty_and_vectors():

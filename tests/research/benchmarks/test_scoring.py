@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 
 from oiio_msspl import Render
 from oiio_msspl.image.colour import srgb
-from research.benchmarks import accuracy, oidn, passes, peers, results, scenes, tables
+from research.benchmarks import accuracy, oidn, one_size, passes, peers, results, scenes, tables
 from research.benchmarks.layout import Column, Line, Table, clean, ratio_with_interval, with_interval
 from tests.conftest import downsample, picture
 
@@ -32,6 +32,12 @@ def test_scores_are_those_of_the_definitions():
     assert row["psnr"] == pytest.approx(-20 * np.log10(srgb(image[0, 0, 0]) - srgb(GREY[0, 0, 0])), abs=1e-3)
     assert row["relmse"] == pytest.approx(0.5 * 0.11**2 / (0.25**2 + 0.01), rel=1e-4)
     assert row["relmse_gharbi"] == pytest.approx(0.11**2 / (0.25**2 + 1e-4), rel=1e-4)
+
+
+def test_two_seeds_are_averaged_by_their_samples():
+    scene = SimpleNamespace(hrls=lambda spp: Render.from_arrays("", rgb=np.full_like(GREY, spp)))
+    name, picture_of = next(one_size.of_two(scene, {1: []}, (1, 3)))
+    assert name == "render, two seeds" and (picture_of() == (1 * 1 + 3 * 3) / 4).all()
 
 
 def test_black_references_and_lamps_keep_scores_finite():

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 onnx = pytest.importorskip("onnx")
+pytest.importorskip("torch")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 from onnx.external_data_helper import set_external_data  # noqa: E402
 
 from oiio_msspl.model.catalogue import WEIGHTS  # noqa: E402
 from oiio_msspl.model.runtime import load_network  # noqa: E402
+from research.training.export import HALF_DROPPED, rounded_half  # noqa: E402
 from research.training.share import share  # noqa: E402
 
 SIZE = 2000
@@ -82,3 +84,12 @@ def test_no_model_that_ships_repeats_a_tensor(folder: Path):
                 data = (folder / place[0]).read_bytes()[place[1] :][: int(entries["length"])]
             if len(data) >= 4096:
                 assert seen.setdefault(data, place) == place, f"{path.name}: {tensor.name} lies in {place}, too"
+
+
+def test_the_sum_of_an_outputs_weights_survives_rounding():
+    weights = np.random.default_rng(0).uniform(0.51, 0.98, (8, 64, 3, 3)).astype(np.float32)
+    rounded = rounded_half(weights)
+    assert not (rounded.view(np.uint16) % (1 << HALF_DROPPED)).any()
+    step = 2.0 ** (HALF_DROPPED - 11)  # of half floats from 0.5 to 1, without these bits
+    errors = rounded.astype(np.float64) - weights
+    assert np.abs(errors).max() < 1.2 * step and np.abs(errors.sum(axis=(1, 2, 3))).max() < 0.6 * step

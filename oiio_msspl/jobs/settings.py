@@ -19,6 +19,7 @@ from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of, for_spread_noise, load_model
 from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.session import Session
+from oiio_msspl.wording import worded
 
 #: Bytes above which a size is a slip. Larger numbers are infinite as floats.
 LARGEST_MEMORY = 1 << 62
@@ -116,10 +117,8 @@ def choose_model(
         suited = for_spread_noise(model)
         spread = suited is not None and is_spread()
         if spread:
-            hr.notes.append(
-                f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise; use "
-                f"--model {suited}"
-            )
+            text = f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise"
+            hr.notes.append(worded(f"{text}; use --model {suited}"))
         return model, spread is not None
     suited = family_for_layers(hr, family)
     if suited != family:

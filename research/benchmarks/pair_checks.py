@@ -100,7 +100,7 @@ class Pair:
         """Return what the checks say, or why they refuse the pair."""
         lrhs, hrls = np.ascontiguousarray(self.lrhs[RGB]), {k: np.ascontiguousarray(v) for k, v in self.hrls.items()}
         try:
-            return check_renders(Render.from_arrays("lr", rgb=lrhs), Render.from_arrays("hr", **hrls)).warnings
+            return [*check_renders(Render.from_arrays("lr", rgb=lrhs), Render.from_arrays("hr", **hrls)).warnings]
         except InputError as error:
             return [str(error)]
 

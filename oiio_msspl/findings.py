@@ -38,6 +38,7 @@ CODES = {
     "different_place": "a part of the frame shows different things",
     "shifted_aov": "an albedo or normal is shifted against the picture",
     "foreign_aov": "an albedo or normal is not of this frame",
+    "negated_normal": "the normals of one render are those of the other one, negated",
     "not_judged": "something could not be judged",
 }
 

@@ -21,6 +21,7 @@ from oiio_msspl.fusion.checks.colours import different_colours
 from oiio_msspl.fusion.checks.edges import Aovs, judge_aovs
 from oiio_msspl.fusion.checks.framing import Framing, central_slices, find_framing, jackknife_error, parts
 from oiio_msspl.fusion.checks.likeness import ALIKE, VISIBLE, correlations, tone_mapped
+from oiio_msspl.fusion.checks.primaries import different_primaries
 from oiio_msspl.fusion.checks.same_noise import MIDDLE, compare_noise
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import bucket_side, read_lrhs, read_tile
@@ -41,6 +42,9 @@ TYPICAL_RATIO = 1.1
 MAX_SHIFT = (0.75, 0.3)
 #: Framings also differ if the zoom moves the edge of the frame by more LRHS pixels than this.
 MAX_ZOOM_AT_EDGE = 0.8
+#: The normals of one render are negated if the mean cosine between those of both is below this. Those of right pairs
+#: reach 0.80 in 38 views, and negated ones -0.80.
+NEGATED = -0.5
 #: A difference of exposure must be this many standard errors from none.
 CERTAIN = 6.0
 #: Groups of blocks that show different things: side of a block in LRHS pixels, blocks along each side of the group, and
@@ -73,7 +77,7 @@ def check_renders(lr: ReadableRender, hr: ReadableRender) -> Judgement:
     """
     alignment = align(lr, hr)
     grid = alignment.grid
-    lrhs = read_lrhs(lr, alignment, grid, [RGB])
+    lrhs = read_lrhs(lr, alignment, grid, [RGB, NORMAL])
     averages = HrlsAverages(alignment)
     for band in grid.bands(max(1, PIXELS_PER_READ // (grid.width * alignment.scale**2))):
         averages.add(read_tile(Tile(band, band), lrhs, grid, hr, alignment, [RGB, ALBEDO, NORMAL]))
@@ -145,7 +149,8 @@ def _judge(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> Judgem
     if not 1 / EXPOSURE_RATIO < ratio < EXPOSURE_RATIO and certain and _is_typical(ratio, hrls):
         text = f"the HRLS is {ratio:.3g} times as bright as the LRHS: are exposure and view layer the same?"
         judgement.warnings.append(Finding("exposure", text))
-    colours = different_colours(*(hrls.blocks[..., i : i + 3].reshape(-1, 3) / BLOCK**2 for i in (0, 3)))
+    blocks = [hrls.blocks[..., i : i + 3] / BLOCK**2 for i in (0, 3)]
+    colours = different_colours(*(block.reshape(-1, 3) for block in blocks)) or different_primaries(*blocks)
     if colours is not None:
         judgement.warnings.append(Finding("colours", f"{colours}: write both in the same colour space"))
     _judge_aovs(judgement, aovs(), hrls)
@@ -253,6 +258,15 @@ def _judge_aovs(judgement: Judgement, aovs: Aovs, hrls: HrlsAverages) -> None:
         )
         for aov in aovs.foreign
     ]
+    agree = hrls.normals_agree
+    if agree is not None and agree < NEGATED:
+        text = (
+            "the normals of the two renders point in opposite directions: negate them in one "
+            "(--map normal=LAYER says which layer they are)"
+        )
+        judgement.warnings.append(Finding("negated_normal", text))
+    elif agree is None and hrls.normal_edges is not None:
+        judgement.not_judged.append(_not_judged("which way the normals point"))
     has = {ALBEDO: hrls.albedo is not None, NORMAL: hrls.normal_edges is not None}
     judgement.not_judged += [
         _not_judged(f"the {aov}") for aov, there in has.items() if there and aov not in aovs.judged

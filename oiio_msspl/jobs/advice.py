@@ -24,7 +24,7 @@ MANY_SPP, LARGEST_SHARE = 3, 1 / 3
 
 
 def advise(lr: MappedRender, hr: MappedRender, spread: bool | None, *, in_shot: bool) -> list[Finding]:
-    """Return what more would help for a frame, one or two sentences each, and what does not pay.
+    """Return what more would help for a frame, one or two sentences each, and what does not pay. For a result: nothing.
 
     Args:
         lr, hr: the pair; one render is both.
@@ -35,6 +35,8 @@ def advise(lr: MappedRender, hr: MappedRender, spread: bool | None, *, in_shot: 
         InputError: the pair does not fit together.
     """
     scale = align(lr, hr).scale
+    if any(name.startswith("msspl/") for name in hr.metadata):
+        return []  # it is fused already
     advice = [*_layers(hr, in_shot), *_filter(spread)]
     if lr is hr:
         advice.append(_second_seed())

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -33,6 +34,8 @@ from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import ShotFrame, State
 from oiio_msspl.jobs.report import FrameReport, provenance
 
+log = logging.getLogger(__name__)
+
 
 def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bool = False) -> None:
     """Write the EXR and the preview of a frame that is settled.
@@ -62,6 +65,7 @@ def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bo
     )
     frame.state, frame.picture = State.WRITTEN, None
     frame.report.seconds["write"] = time.perf_counter() - start
+    log.debug("report: %s", frame.report.as_dict())
 
 
 def write_frame(

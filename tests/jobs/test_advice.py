@@ -86,6 +86,15 @@ def test_frames_of_a_shot_are_told_of_motion_vectors(tmp_path):
     assert "add_motion" not in check_files(None, high).codes  # no frame follows
 
 
+def test_a_result_gets_no_advice(tmp_path):
+    image = picture(64, 64)
+    write_exr(tmp_path / "out.exr", rgb(image), **{"msspl/model": "joint-x1"})
+    inspections = [inspect_file(tmp_path / "out.exr", InputOptions())]
+    inspect_noise(inspections)
+    assert inspections[0].advice == [] == check_files(None, tmp_path / "out.exr").advice
+    assert any(fact.startswith("a result, fused with joint-x1") for fact in inspections[0].facts)
+
+
 def test_spread_noise_is_told_of_a_box_filter(tmp_path):
     clean = picture(128, 128)
     low, high = (write(tmp_path / f"{n}.exr", spread(noisy(clean, 1, n), 0.8)) for n in (1, 2))

@@ -28,7 +28,7 @@ GROUP = 3
 LARGEST = 0.1
 
 #: Grey pictures have no primaries: P3 shifts their chromaticities by less than the root of this.
-LEAST = 1e-7
+LEAST = 1e-9
 
 Colours = NDArray[np.float64]
 _TO_P3 = conversion(REC709, P3)

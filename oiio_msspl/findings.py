@@ -57,14 +57,13 @@ class Finding(str):
     """A sentence about a render, with a ``code`` that programs can test: a key of ``CODES`` or ``ADVICE``."""
 
     code: str
+    _text: str
 
     def __new__(cls, code: str, text: str) -> Finding:
         """Make a finding. The text may name options, see :func:`oiio_msspl.wording.worded`."""
         finding = super().__new__(cls, worded(text))
         finding.code, finding._text = code, text
         return finding
-
-    _text: str
 
     def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
         """Return what a copy is made of. A worker's finding is worded by the process that reads it."""

@@ -7,23 +7,29 @@ only, so the watching thread calls ``nuke.executeInMainThread``.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import tempfile
+import textwrap
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import nuke
-from msspl_bridge.command import Settings, build_command, clean_environment, find_program
-from msspl_bridge.errors import Cancelled, FuseError
-from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output
+from msspl_bridge.command import Settings, build_command, clean_environment, find_program, split_words
+from msspl_bridge.errors import FuseError
+from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output, parse_range
 from msspl_bridge.passes import ATTRIBUTE, FusedSet, fused_sets
-from msspl_bridge.process import run
+from msspl_bridge.process import Outcome, run
 
 #: Nodes that change neither pixels nor time. They may stand between the Read and the gizmo.
 _PASS_THROUGH = ("Dot", "NoOp", "PostageStamp")
 #: Knobs whose values go into the command line as text.
-_KNOBS = ("model", "device", "mapping", "layers", "passes", "temporal", "options")
+_KNOBS = ("quality", "model", "device", "mapping", "layers", "passes", "temporal", "options", "chunk")
+#: What Nuke calls the file that a Read reads, in its metadata.
+_FILE = "input/filename"
 #: A hidden knob on the Read of a result. It holds the name of the node that made the Read.
 _MADE_BY = "msspl_made_by"
 #: Full names of the nodes that are fusing now.
@@ -39,19 +45,23 @@ def add_menu() -> None:
 
 def fuse_frame(node: nuke.Node) -> None:
     """Fuse the current frame in the background."""
-    frame = int(nuke.frame())
-    _start(node, frame, frame, as_range=False)
+    _start(node, int(nuke.frame()))
 
 
 def fuse_range(node: nuke.Node) -> None:
-    """Fuse the frames of the range knobs in the background."""
-    _start(node, int(node["first"].value()), int(node["last"].value()), as_range=True)
+    """Fuse the frames of the range in the background."""
+    _start(node)
+
+
+def submit_range(node: nuke.Node) -> None:
+    """Write the range as a job for a farm, and submit it, in the background."""
+    _start(node, on_farm=True)
 
 
 def rebuild(node: nuke.Node) -> None:
     """Make a group for each fused set, below the Read of the fused file, that builds the beauty from the layers."""
     try:
-        with node.parent():
+        with _undo_step("Rebuild from passes"), node.parent():
             read = _made_read(node.name())
             if read is None:
                 raise FuseError("nothing is fused yet; fuse a frame first")
@@ -68,19 +78,32 @@ def copy_to_group() -> None:
     gizmos = [n for n in nuke.selectedNodes() if isinstance(n, nuke.Gizmo) and n.knob("fuse_frame")]
     if not gizmos:
         nuke.message("Select an MSSPLFuse gizmo first. A group needs no copy.")
-    for gizmo in gizmos:
-        name = gizmo.name()
-        with gizmo.parent():
-            group = gizmo.makeGroup()
-        for i in range(gizmo.inputs()):
-            group.setInput(i, gizmo.input(i))
-        for user in gizmo.dependent(nuke.INPUTS | nuke.HIDDEN_INPUTS):
-            for i in range(user.inputs()):
-                if user.input(i) == gizmo:
-                    user.setInput(i, group)
-        group.setXYpos(gizmo.xpos(), gizmo.ypos())
-        nuke.delete(gizmo)
-        group.setName(name)
+    with _undo_step("Copy to group"):
+        for gizmo in gizmos:
+            name = gizmo.name()
+            with gizmo.parent():
+                group = gizmo.makeGroup()
+            for i in range(gizmo.inputs()):
+                group.setInput(i, gizmo.input(i))
+            for user in gizmo.dependent(nuke.INPUTS | nuke.HIDDEN_INPUTS):
+                for i in range(user.inputs()):
+                    if user.input(i) == gizmo:
+                        user.setInput(i, group)
+            group.setXYpos(gizmo.xpos(), gizmo.ypos())
+            nuke.delete(gizmo)
+            group.setName(name)
+
+
+@contextlib.contextmanager
+def _undo_step(name: str) -> Iterator[None]:
+    """Make all changes of a ``with`` block one step for Undo."""
+    undo = nuke.Undo()
+    undo.begin()
+    undo.name(name)
+    try:
+        yield
+    finally:
+        undo.end()
 
 
 # ---------------------------------------------------------------------------------- start a job, in the main thread
@@ -95,18 +118,19 @@ class _Job:
     """Full name of the node."""
     colour_knobs: dict[str, str]
     """Knobs of the HRLS's Read. The fused file is encoded like the HRLS, so its Read gets the same values."""
-    command: list[str]
+    commands: list[list[str]]
+    """They run one after another: one for each view."""
     environment: dict[str, str]
     out: FrameFile
-    numbers: tuple[int, int] | None
-    """First and last number in the file names of a range. None for one frame."""
     offset: int
     """Number in a file name minus Nuke's frame."""
+    on_farm: bool
 
 
-def _start(node: nuke.Node, first: int, last: int, as_range: bool) -> None:
+def _start(node: nuke.Node, frame: int | None = None, on_farm: bool = False) -> None:
+    """Start a job for a frame, or for the range."""
     try:
-        job = _prepare(node, first, last, as_range)
+        job = _prepare(node, frame, on_farm)
     except FuseError as error:
         nuke.message(f"{node.name()}: {error}")
         return
@@ -114,43 +138,65 @@ def _start(node: nuke.Node, first: int, last: int, as_range: bool) -> None:
     threading.Thread(target=_watch, args=(job,), name=f"msspl-fuse for {job.name}", daemon=True).start()
 
 
-def _prepare(node: nuke.Node, first: int, last: int, as_range: bool) -> _Job:
+def _prepare(node: nuke.Node, frame: int | None, on_farm: bool) -> _Job:
     name = node.fullName()
     if name in _running:
         raise FuseError("is still fusing; wait, or cancel it in the progress window")
     if nuke.root().proxy():
         raise FuseError("proxy mode is on; turn it off, because MSSPLFuse needs the full-size files")
-    if last < first:
-        raise FuseError(f"the range {first} to {last} is empty; its first frame must not be after its last")
-    reads = lr_read, hr_read = _find_read(node, 0, "LRHS"), _find_read(node, 1, "HRLS")
-    lrhs, hrls = _file_at(lr_read, first), _file_at(hr_read, first)
-    out = name_output(_path(node, "output"), hrls, first)
-    numbers = None
-    if as_range:
-        ranges = [ReadRange(read.name(), _file_at(read, first), _file_at(read, last)) for read in reads]
-        numbers = file_numbers(ranges, out, first, last)
-    settings = Settings(**{knob: _text(node, knob) for knob in _KNOBS}, overwrite=bool(node["overwrite"].value()))
-    program = find_program(_path(node, "program"), os.environ)
+    hr_read, lr_read = _find_read(node, 0, "HRLS"), _find_read(node, 1, "LRHS")
+    if hr_read is None:
+        raise FuseError("nothing is connected to HRLS; connect the Read of the render")
+    reads = [hr_read] if lr_read is None else [lr_read, hr_read]
+    frames = _range_of(node, reads) if frame is None else range(frame, frame + 1)
+    views = _views(hr_read, frames, _path(node, "output"))
+    out = name_output(_path(node, "output"), _find_file(hr_read, frames, views[0]), frames[0])
+    if views[0] and "%v" not in out.pattern.lower():
+        raise FuseError(f"output {out.path}: has no %V or %v, so the views would replace each other")
     return _Job(
         node=node,
         name=name,
         colour_knobs={knob: hr_read[knob].toScript() for knob in ("raw", "colorspace")},
-        command=build_command(program, lrhs, hrls, out, settings, numbers),
+        commands=_commands(node, reads, out, views, frames, frame is None, on_farm),
         environment=clean_environment(os.environ, os.path.dirname(nuke.EXE_PATH)),
         out=out,
-        numbers=numbers,
-        offset=0 if out.number is None else out.number - first,
+        offset=0 if out.number is None else out.number - frames[0],
+        on_farm=on_farm,
     )
 
 
-def _find_read(node: nuke.Node, index: int, label: str) -> nuke.Node:
-    """Return the Read that feeds an input, directly or through nodes that change nothing."""
+def _commands(
+    node: nuke.Node,
+    reads: list[nuke.Node],
+    out: FrameFile,
+    views: list[str],
+    frames: range,
+    as_range: bool,
+    on_farm: bool,
+) -> list[list[str]]:
+    """Build the command lines of each view."""
+    program = find_program(_path(node, "program"), os.environ)
+    submit = split_words("submit with", _text(node, "submit"))
+    knobs: dict[str, Any] = {knob: _text(node, knob) for knob in _KNOBS}
+    settings = Settings(**knobs, overwrite=bool(node["overwrite"].value()))
+    commands = []
+    for view in views:
+        ends = [ReadRange(r.name(), _find_file(r, frames, view), _find_file(r, frames[::-1], view)) for r in reads]
+        numbers = file_numbers(ends, out, frames[0], frames[-1]) if as_range else None
+        bundle = os.path.join(tempfile.mkdtemp(prefix="msspl-"), "job") if on_farm else ""
+        files = [file.in_view(view) for file in (*(end.first for end in ends), out)]
+        commands.append(build_command(program, files, settings, numbers, bundle))
+        if bundle and submit:
+            commands.append([*submit, bundle])
+    return commands
+
+
+def _find_read(node: nuke.Node, index: int, label: str) -> nuke.Node | None:
+    """Return the Read that feeds an input, directly or through nodes that change nothing; None if there is none."""
     source = node.input(index)
     while source is not None and source.Class() in _PASS_THROUGH:
         source = source.input(0)
-    if source is None:
-        raise FuseError(f"nothing is connected to {label}; connect the Read of that render")
-    if source.Class() != "Read":
+    if source is not None and source.Class() != "Read":
         raise FuseError(
             f"{label} is connected to {source.name()} ({source.Class()}), but MSSPLFuse reads files; connect the Read "
             "itself, or write the image to an EXR and read that"
@@ -158,12 +204,36 @@ def _find_read(node: nuke.Node, index: int, label: str) -> nuke.Node:
     return source
 
 
-def _file_at(read: nuke.Node, frame: int) -> FrameFile:
-    """Ask Nuke for the file that a Read reads at a frame. Nuke follows every frame mode and expression."""
-    pattern, path = nuke.filename(read), read.metadata("input/filename", frame)
-    if not pattern or not path:
-        raise FuseError(f"{read.name()} has no file at frame {frame}; go to a frame that is rendered")
-    return find_number(pattern, str(path))
+def _range_of(node: nuke.Node, reads: list[nuke.Node]) -> range:
+    """Return the frames of the knob; if it is empty, those that all Reads have."""
+    text = _text(node, "frames")
+    if text:
+        return parse_range(text)
+    frames = range(max(read.firstFrame() for read in reads), min(read.lastFrame() for read in reads) + 1)
+    if not frames:
+        raise FuseError("the Reads have no frame in common; connect renders of the same frames")
+    return frames
+
+
+def _views(read: nuke.Node, frames: range, output: str) -> list[str]:
+    """Return the views that have files; only "" if the names of files have no view."""
+    if "%v" not in f"{nuke.filename(read)}{output}".lower():
+        return [""]
+    return [view for view in nuke.views() if any(read.metadata(_FILE, frame, view) for frame in frames)] or [""]
+
+
+def _find_file(read: nuke.Node, frames: range, view: str = "") -> FrameFile:
+    """Ask Nuke, which follows frame modes and expressions, for the file of the first of these frames.
+
+    If it is missing, the next one that exists tells its number.
+    """
+    pattern = nuke.filename(read)
+    for frame in frames:
+        path = read.metadata(_FILE, frame, view) if view else read.metadata(_FILE, frame)
+        if pattern and path:
+            file = find_number(pattern, str(path))
+            return file if file.number is None else replace(file, number=file.number + frames[0] - frame)
+    raise FuseError(f"{read.name()} has no file at frame {frames[0]}; go to a frame that is rendered")
 
 
 def _text(node: nuke.Node, knob: str) -> str:
@@ -179,53 +249,45 @@ def _path(node: nuke.Node, knob: str) -> str:
 
 
 def _watch(job: _Job) -> None:
-    task = nuke.ProgressTask(job.name)
-    task.setMessage(f"fusing {os.path.basename(job.out.path)}")
-
-    def report(percent: int | None, message: str | None) -> None:
-        if percent is not None:
-            task.setProgress(percent)
-        if message is not None:
-            task.setMessage(message)
-
-    warnings: list[str] = []
-    done = False
+    title = f"{job.name}: {os.path.basename(job.out.path)}"
     try:
-        warnings = run(job.command, job.environment, report, task.isCancelled)
-        done = True
-    except Cancelled:
-        pass
-    except Exception as error:
-        text = error if isinstance(error, FuseError) else f"unexpected {type(error).__name__}: {error}"
-        nuke.executeInMainThread(nuke.message, args=(f"{job.name}: {text}",))
+        # Nuke closes the window when nothing refers to the task any more, so it is in no variable here.
+        outcome = run(job.commands, job.environment, nuke.ProgressTask(title))
+    except Exception as error:  # kept as text, because it refers to the task
+        outcome = Outcome(error=str(error) if isinstance(error, FuseError) else f"unexpected {error!r}")
     finally:
         _running.discard(job.name)
-    if done or _has_frames(job):
-        nuke.executeInMainThread(_show, args=(job, warnings))
-
-
-def _has_frames(job: _Job) -> bool:
-    """Return whether a range that failed or was cancelled has at least one finished frame."""
-    numbers = range(job.numbers[0], job.numbers[1] + 1) if job.numbers else ()
-    return any(os.path.exists(replace(job.out, number=n).path) for n in numbers)
+    nuke.executeInMainThread(_finish, args=(job, outcome))
 
 
 # ---------------------------------------------------------------------------------- show the result, in the main thread
 
 
-def _show(job: _Job, warnings: list[str]) -> None:
-    """Load the result into the Read that an earlier job made for this node, or into a new one below the node."""
-    for warning in warnings:
-        nuke.warning(f"{job.name}: {warning}")
+def _finish(job: _Job, outcome: Outcome) -> None:
+    """Load the frames that are there, and show in the node what was said."""
     try:
-        node_name, parent = job.node.name(), job.node.parent()
+        node_name = job.node.name()
     except ValueError:  # Nuke raises it for a deleted node.
-        nuke.message(f"{job.name} was deleted; its result is {job.out.pattern}")
+        nuke.message(f"{job.name} was deleted; {outcome.error or f'its result is {job.out.pattern}'}")
         return
-    with parent:
+    frames = ", ".join(f"{number} {status}" for status, number in outcome.counts.items())
+    said = [frames or ("done" if outcome.finished else "not done"), *dict.fromkeys(outcome.notes)]
+    lines = [textwrap.fill(text, 90) for text in said] + [outcome.last] * job.on_farm
+    with _undo_step(job.name):
+        job.node["found"].setValue("\n".join(lines))
+        if outcome.written or (outcome.finished and not job.on_farm):
+            _load(job, node_name, outcome.written)
+    if outcome.error:
+        nuke.message(f"{job.name}: {outcome.error}")
+
+
+def _load(job: _Job, node_name: str, written: list[int]) -> None:
+    """Load frames into the Read that an earlier job made for this node, or into a new one below the node."""
+    with job.node.parent():
         made = _made_read(node_name)
         read = made or _new_read(job.node, node_name)
-    first, last = job.numbers or (1 if job.out.number is None else job.out.number,) * 2
+    numbers = written or [1 if job.out.number is None else job.out.number]
+    first, last = min(numbers), max(numbers)
     if read["file"].value() == job.out.pattern:  # Frames that were fused one by one extend the Read's range.
         first, last = min(first, int(read["first"].value())), max(last, int(read["last"].value()))
     read["file"].setValue(job.out.pattern)

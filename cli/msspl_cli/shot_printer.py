@@ -13,7 +13,7 @@ from oiio_msspl.errors import InputError
 if TYPE_CHECKING:
     from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
 
-#: The forms of ``--progress``, which prints to standard output after each frame.
+#: The forms of ``--progress``, which prints to standard output before the first frame is fused and after each frame.
 PROGRESS = ("openjd", "json")
 
 
@@ -38,6 +38,8 @@ class ShotPrinter:
 
     def begin(self, report: ShotReport) -> None:
         """Print what was found and what will be done, before the first frame is fused."""
+        if self._progress == "json":
+            print(json.dumps({"found": report.found, "temporal": report.temporal}), flush=True)
         if self._as_json or self._quiet or self._progress == "json":
             return
         if found := report.found:

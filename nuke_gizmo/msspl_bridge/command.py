@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds msspl-fuse, and builds its command line and its environment."""
+"""Finds msspl-fuse and msspl, and builds their command lines and their environment."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from msspl_bridge.errors import FuseError
@@ -28,7 +28,9 @@ _LIBRARY_PATHS = (
 class Settings:
     """The values of the knobs, as text."""
 
+    quality: str = "balanced"
     model: str = ""
+    """A model, or an ONNX file, instead of a quality."""
     device: str = "cpu"
     mapping: str = ""
     """One ``feature=layer`` per line, such as ``albedo=my_albedo``."""
@@ -40,53 +42,80 @@ class Settings:
     """Neighbours that a frame is averaged with: ``auto``, ``off``, or the number of frames before and after it."""
     options: str = ""
     """Further options, quoted as in a shell."""
+    chunk: str = "10"
+    """Frames that a task of a farm fuses."""
     overwrite: bool = True
 
 
 def build_command(
     program: str,
-    lrhs: FrameFile,
-    hrls: FrameFile,
-    out: FrameFile,
+    files: Sequence[FrameFile],
     settings: Settings,
     numbers: tuple[int, int] | None = None,
+    bundle: str = "",
 ) -> list[str]:
     """Build the command line for one frame or, given the first and last file number, for a range.
 
     A single frame is averaged with its neighbours, too, so that it has the pixels that a range would give it. It is
     fused alone if its files have no numbers, or different ones: msspl-fuse pairs the files of neighbours by number.
 
+    Args:
+        program: the path of msspl-fuse. msspl lies beside it.
+        files: the LRHS if there is one, the HRLS, and the result.
+        bundle: write the range as a job for a farm into this new folder, instead of fusing it.
+
     Raises:
-        FuseError: the mapping or the options cannot be parsed.
+        FuseError: the mapping or the options cannot be parsed, or there is no msspl.
     """
-    first, last = numbers or (out.number, out.number)
-    in_shot = numbers is not None or (settings.temporal != "off" and lrhs.number == hrls.number == first is not None)
-    files = [file.pattern if in_shot else file.path for file in (lrhs, hrls, out)]
-    command = [program, files[0], files[1], "-o", files[2], "--device", settings.device]
+    number = files[-1].number
+    first, last = numbers or (number, number)
+    in_shot = numbers is not None or all(file.number == number is not None for file in files)
+    *renders, result = (file.pattern if in_shot else file.path for file in files)
+    command = [*([_msspl_beside(program), "submit"] if bundle else [program]), *renders, "-o", result]
     if in_shot:
-        frames = f"{first}" if first == last else f"{first}-{last}"
-        command += ["--frames", frames, "--temporal", settings.temporal, "--progress", "openjd"]
+        command += ["--frames", f"{first}" if first == last else f"{first}-{last}", "--temporal", settings.temporal]
+    if bundle:
+        # Tasks skip what exists; with --update only what is newer than its renders.
+        command += ["--bundle", bundle, "--chunk", settings.chunk, *(["--update"] if settings.overwrite else [])]
+    else:
+        command += ["--progress", "json"] if in_shot else []
+        command += ["--overwrite"] if settings.overwrite else ["--skip-existing"] if numbers else []
+    return command + _options(settings)
+
+
+def _msspl_beside(program: str) -> str:
+    found = shutil.which("msspl", path=os.path.dirname(program))
+    if found is None:
+        raise FuseError(f"there is no msspl beside {program}; name msspl-fuse where the package is installed")
+    return found
+
+
+def _options(settings: Settings) -> list[str]:
+    """Return the options that do not depend on the files."""
+    choice = ["--model", settings.model] if settings.model else ["--quality", settings.quality]
     # The layout of Nuke's own Write: one part per layer, named after the layer.
-    command += ["--layout", "nuke", "--no-preview"]
-    if settings.model:
-        command += ["--model", settings.model]
+    options = [*choice, "--device", settings.device, "--layout", "nuke", "--no-preview"]
     for line in filter(None, map(str.strip, settings.mapping.splitlines())):
         feature, equals, layer = line.partition("=")
         if not (feature.strip() and equals and layer.strip()):
             raise FuseError(f"mapping {line!r}: write one feature=layer per line, such as albedo=my_albedo")
-        command += ["--map", f"{feature.strip()}={layer.strip()}"]
+        options += ["--map", f"{feature.strip()}={layer.strip()}"]
     for option, patterns in (("--layers", settings.layers), ("--passes", settings.passes)):
         for pattern in filter(None, map(str.strip, patterns.split(","))):
-            command += [option, pattern]
-    if settings.overwrite:
-        command.append("--overwrite")
-    elif numbers is not None:
-        command.append("--skip-existing")
+            options += [option, pattern]
+    return options + split_words("options", settings.options)
+
+
+def split_words(knob: str, text: str) -> list[str]:
+    """Split the value of a knob as a shell does.
+
+    Raises:
+        FuseError: a quotation has no end.
+    """
     try:
-        # shlex would remove the backslashes of Windows paths.
-        return command + shlex.split(with_slashes(settings.options))
+        return shlex.split(with_slashes(text))  # shlex would remove the backslashes of Windows paths
     except ValueError as error:
-        raise FuseError(f"options {settings.options!r}: {error}; quote them as in a shell") from error
+        raise FuseError(f"{knob} {text!r}: {error}; quote them as in a shell") from error
 
 
 def find_program(chosen: str, environment: Mapping[str, str]) -> str:
@@ -121,5 +150,5 @@ def clean_environment(environment: Mapping[str, str], host_folder: str) -> dict[
             kept = [p for p in paths if p and not os.path.join(os.path.realpath(p), "").startswith(folder)]
             if kept:
                 clean[key] = os.pathsep.join(kept)
-    # Messages arrive in UTF-8 on every platform, and without delay.
-    return {**clean, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1"}
+    # Messages arrive in UTF-8 on every platform, without delay, and each in a line of its own.
+    return {**clean, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "TERMINAL_WIDTH": "10000"}

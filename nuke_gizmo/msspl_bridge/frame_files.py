@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads file names of numbered frames: finds the number, names the output, and checks a range."""
+"""Reads file names of numbered frames: finds number and view, names the output, and checks a range."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _VIEW = re.compile(r"%[vV]")
 
 @dataclass(frozen=True)
 class FrameFile:
-    """The file of one frame of a numbered sequence, or a still."""
+    """The file of one frame of a numbered sequence, or a still. ``%V`` and ``%v`` stand for the view."""
 
     head: str
     """The path up to the number. For a still, the whole path."""
@@ -36,6 +36,11 @@ class FrameFile:
         """The name of the whole sequence, such as ``/shot/hr.%04d.exr``. Nuke and msspl-fuse both read this form."""
         return self.head if self.number is None else f"{self.head}%0{self.digits}d{self.tail}"
 
+    def in_view(self, view: str) -> FrameFile:
+        """Return the file of a view: ``%V`` is its name, ``%v`` its first letter."""
+        head, tail = (part.replace("%V", view).replace("%v", view[:1]) for part in (self.head, self.tail))
+        return replace(self, head=head, tail=tail)
+
 
 @dataclass(frozen=True)
 class ReadRange:
@@ -51,24 +56,39 @@ def find_number(pattern: str, path: str) -> FrameFile:
     """Split the path of a frame into head, number and tail.
 
     Args:
-        pattern: the file knob of the Read, with ``%04d`` or ``####`` for the number and ``%V`` or ``%v`` for the view.
+        pattern: the file knob of the Read, with ``%04d`` or ``####`` for the number. If it has ``%V`` or ``%v`` for the
+            view, head and tail have it, too.
         path: the file that Nuke found through the pattern.
 
     Raises:
         FuseError: the path does not match the pattern.
     """
-    path = with_slashes(path)
-    folder, name = posixpath.split(path)
-    expected = posixpath.basename(with_slashes(pattern))
+    pattern, path = with_slashes(pattern), with_slashes(path)
+    folder, expected = posixpath.split(pattern)
+    stereo = bool(_VIEW.search(pattern))
+    folder = folder if stereo else posixpath.dirname(path)
     tokens = list(_NUMBER.finditer(expected))
     if not tokens:
-        return FrameFile(path)
+        return FrameFile(pattern if stereo else path)
     token = tokens[-1]
-    head, tail = (_match_any_view(part) for part in (expected[: token.start()], expected[token.end() :]))
-    match = re.fullmatch(f"({head})(-?[0-9]+)({tail})", name)
+    before, after = expected[: token.start()], expected[token.end() :]
+    match = re.fullmatch(f"{_match_any_view(before)}(-?[0-9]+){_match_any_view(after)}", posixpath.basename(path))
     if not match:
         raise FuseError(f"{path}: does not match the pattern {pattern}; rename the file, or correct the Read's file")
-    return FrameFile(posixpath.join(folder, match[1]), int(match[2]), _digits(token), match[3])
+    return FrameFile(posixpath.join(folder, before), int(match[1]), _digits(token), after)
+
+
+def parse_range(text: str) -> range:
+    """Return the frames of ``1001-1100``, or of ``1001``.
+
+    Raises:
+        FuseError: the text is something else, or an empty range.
+    """
+    match = re.fullmatch(r"(-?\d+)(?:-(-?\d+))?", text)
+    frames = range(int(match[1]), int(match[2] or match[1]) + 1) if match else range(0)
+    if not frames:
+        raise FuseError(f"range {text!r}: write the first and the last frame, such as 1001-1100, or leave it empty")
+    return frames
 
 
 def name_output(text: str, hrls: FrameFile, frame: int) -> FrameFile:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs msspl-fuse, reads its progress and its messages, and cancels it."""
+"""Runs programs one after another, reads their progress and their messages, and cancels them."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import queue
 import re
@@ -11,37 +12,96 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from msspl_bridge.errors import Cancelled, FuseError
+from msspl_bridge.errors import FuseError
 
-_MESSAGE = re.compile(r"(openjd_progress|openjd_status|openjd_fail|error|warning): (.*)")
+#: The box that the command line draws around a mistake in the options.
+_BOX = " \u2502\n"
 #: Seconds that a cancelled msspl-fuse has to remove its temporary file.
 _GRACE = 10
 
 
-def run(
-    command: list[str],
-    environment: Mapping[str, str],
-    report: Callable[[int | None, str | None], None],
-    cancelled: Callable[[], bool],
-) -> list[str]:
-    """Run msspl-fuse until it ends. This blocks, so call it from a thread of its own.
+@dataclass
+class Outcome:
+    """What the programs said."""
+
+    written: list[int] = field(default_factory=list)
+    """Numbers of the frames that are there: fused, or skipped because they existed."""
+    notes: list[str] = field(default_factory=list)
+    """How frames are averaged, and warnings: a sentence each."""
+    error: str = ""
+    """The first failure, which shows the cause; empty if there is none."""
+    finished: bool = False
+    """Whether all programs ended without a failure."""
+    last: str = ""
+    """The last line with a word."""
+    counts: Counter[str] = field(default_factory=Counter)
+    """How many frames ended in which way."""
+
+    def hear(self, line: str) -> dict[str, Any] | None:
+        """Take in a line of output. Return what msspl-fuse says of a frame that ended."""
+        kind, _, text = line.strip().partition(": ")
+        if kind == "warning":
+            self.notes.append(text)
+        elif kind == "error":
+            self.error = self.error or text
+        elif line.startswith('{"found"'):  # before the first frame
+            how = json.loads(line)["temporal"]
+            self.notes += [f"fuses {how}"] if how else []
+        elif line.startswith('{"frame"'):
+            frame: dict[str, Any] = json.loads(line)
+            self.counts[frame["status"]] += 1
+            self.written += [] if frame["message"] else [frame["frame"]]
+            return frame
+        elif re.search(r"\w", line):
+            self.last = line.strip(_BOX)
+        return None
+
+
+def run(commands: Sequence[list[str]], environment: Mapping[str, str], window: Any) -> Outcome:
+    """Run programs one after another until they end. This blocks, so call it from a thread of its own.
+
+    A program that fails without any frame ends the row.
 
     Args:
-        report: called with (percent, None) or with (None, the current step).
-        cancelled: asked ten times a second. When it returns True, the process and its children are ended.
-
-    Returns:
-        Warnings, one sentence each.
+        window: a ProgressTask of Nuke. It is asked ten times a second whether the artist cancelled. Then the program
+            and its children are ended: finished frames stay on disk, and no file is half-written.
 
     Raises:
-        FuseError: msspl-fuse failed. The message is its own.
-        Cancelled: finished frames stay on disk, and no file is half-written.
+        FuseError: a program can't be started.
     """
+    outcome, code = Outcome(), 0
+    for index, command in enumerate(commands):
+        process = _start(command, environment)
+        try:
+            for line in _lines(process, window):
+                if frame := outcome.hear(line):
+                    done, count = frame["done"], frame["count"]
+                    window.setProgress(100 * (index * count + done) // (len(commands) * count))
+                    window.setMessage(f"frame {frame['frame']} {frame['status']}, {done} of {count} done")
+            if window.isCancelled():
+                return outcome
+            code = process.wait() or code
+        finally:
+            if process.poll() is None:
+                _end(process)
+        if code and not outcome.written:
+            break
+    if code:
+        bad = outcome.counts["failed"] + outcome.counts["missing"]
+        more = f" ({bad - 1} more failed)" if bad > 1 else ""
+        outcome.error = (outcome.error or outcome.last or f"{command[0]} ended with exit code {code}") + more
+    outcome.finished = not code
+    return outcome
+
+
+def _start(command: list[str], environment: Mapping[str, str]) -> subprocess.Popen[str]:
     try:
-        process = subprocess.Popen(
+        return subprocess.Popen(
             command,
             env=dict(environment),
             stdin=subprocess.DEVNULL,
@@ -52,46 +112,19 @@ def run(
             **_own_group(),
         )
     except OSError as error:
-        raise FuseError(f"{command[0]}: can't be started ({error.strerror}); check that it is msspl-fuse") from error
+        raise FuseError(f"{command[0]}: can't be started ({error.strerror}); check the path") from error
+
+
+def _lines(process: subprocess.Popen[str], window: Any) -> Iterator[str]:
+    """Yield the lines of output, until the artist cancels."""
     lines: queue.Queue[str | None] = queue.Queue()
     threading.Thread(target=_read_lines, args=(process, lines), daemon=True).start()
-    warnings, errors, last = [], [], ""
-    try:
-        while True:
-            if cancelled():
-                raise Cancelled
-            try:
-                line = lines.get(timeout=0.1)
-            except queue.Empty:
-                continue
+    while not window.isCancelled():
+        with contextlib.suppress(queue.Empty):
+            line = lines.get(timeout=0.1)
             if line is None:
-                break
-            kind, text = parse_line(line)
-            last = text or last
-            if kind == "openjd_progress":
-                with contextlib.suppress(ValueError):
-                    report(int(float(text)), None)
-            elif kind == "openjd_status":
-                report(None, text)
-            elif kind == "warning":
-                warnings.append(text)
-            elif kind and text not in errors:  # "openjd_fail" and "error" both carry the text of one failure
-                errors.append(text)
-        code = process.wait()
-    finally:
-        if process.poll() is None:
-            _end(process)
-    if code:
-        # msspl-fuse goes on with a range after a bad frame. The first failure shows the cause.
-        more = f" ({len(errors) - 1} more frames failed)" if len(errors) > 1 else ""
-        raise FuseError((errors[0] if errors else last or f"msspl-fuse ended with exit code {code}") + more)
-    return warnings
-
-
-def parse_line(line: str) -> tuple[str, str]:
-    """Split a line of msspl-fuse's output into (kind, text). The kind is "" for a line that is only information."""
-    match = _MESSAGE.fullmatch(line.strip())
-    return (match[1], match[2].strip()) if match else ("", line.strip())
+                return
+            yield line
 
 
 def _read_lines(process: subprocess.Popen[str], lines: queue.Queue[str | None]) -> None:

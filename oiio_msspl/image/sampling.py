@@ -13,6 +13,8 @@ from oiio_msspl.image.parallel import for_row_blocks
 
 #: Sharpness of the interpolation: the slope of Keys' cubic at the next pixel. Softer kernels blur with every frame.
 SHARPNESS = -1.0
+#: Positions are rounded to the nearest pixel, halves upwards, also if they are not exact.
+HALF = np.float32(0.501)
 #: All pixels of a block are interpolated, unless a smaller fraction of them than this lies between pixels.
 MOST_CHOSEN = 0.8
 
@@ -20,9 +22,11 @@ MOST_CHOSEN = 0.8
 def nearest_indices(x: Array, y: Array, size: tuple[int, int]) -> NDArray[np.intp]:
     """Return the flat indices of the pixels nearest to positions in an image of ``size`` (height, width)."""
     height, width = size
+    # `rint` rounds halves to even numbers, which would give two neighbours that move alike the same pixel.
+    column, row = (np.floor(positions + HALF) for positions in (x, y))
     # Converting floats to 32 bits is four times as fast as to 64 bits.
-    column = np.clip(np.rint(x), 0, width - 1).astype(np.int32)
-    row = np.clip(np.rint(y), 0, height - 1).astype(np.int32)
+    column = np.clip(column, 0, width - 1).astype(np.int32)
+    row = np.clip(row, 0, height - 1).astype(np.int32)
     return row * np.intp(width) + column
 
 

@@ -59,6 +59,9 @@ def test_progress_for_programs(tmp_path, bilinear_models):
     (folder / "lr/lr.1002.exr").unlink()
     arguments = [folder / "lr", folder / "hr", "-o", folder / "out", "--model", bilinear_models[4], "--no-preview"]
     lines = [json.loads(line) for line in fuse(*arguments, "--progress", "json").stdout.splitlines()]
+    begin = lines.pop(1)  # a missing frame is told before
+    assert (begin["found"]["frame"], begin["found"]["scale"]) == (1001, 4)
+    assert begin["temporal"].startswith("frame by frame: no two frames follow each other")
     assert [(line["frame"], line["status"], line["done"], line["count"]) for line in lines] == [
         (1002, "missing", 1, 3),
         (1001, "fused", 2, 3),

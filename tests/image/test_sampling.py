@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl.image import sampling
-from oiio_msspl.image.sampling import sample_cubic
+from oiio_msspl.image.sampling import nearest_indices, sample_cubic
 
 HEIGHT, WIDTH = 40, 60
 
@@ -47,3 +47,10 @@ def test_a_sample_stays_between_the_four_nearest_pixels(monkeypatch):
     (found,) = sample(monkeypatch, 0, [image], x + np.float32(0.3), y)
     assert found.min() == 0 and found.max() == 1
     assert 0 < found[5, WIDTH // 2 - 1, 0] < 1
+
+
+@pytest.mark.parametrize("error", [0, 1e-5, -1e-5])
+def test_halves_are_rounded_to_one_side(error):
+    """So that no pixel is the nearest one of two positions."""
+    x = np.arange(20, dtype=np.float32) + np.float32(0.5 + error)
+    assert np.array_equal(nearest_indices(x, np.zeros_like(x), (1, 40)), np.arange(1, 21))

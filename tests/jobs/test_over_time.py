@@ -540,6 +540,21 @@ def test_averaging_uses_no_more_threads_than_allowed(shot, whole, bilinear_model
     assert contents(shot / "one thread") == contents(shot / "whole")
 
 
+def test_a_frame_that_flashes_stands_alone_and_is_named(tmp_path, bilinear_models):
+    """The report says how many frames counted, of each frame and in the mean."""
+    shot = make_moving_shot(tmp_path / "shot", count=5)
+    for name in ("lr", "hr"):
+        path = shot / f"{name}/{name}.{FIRST + 2}.exr"
+        channels = read_bits(path)[0][1]
+        write_exr(path, channels | {c: channels[c] * np.float32(1.5) for c in "RGB"})
+    report = run(shot, bilinear_models[4], "flash")
+    counted = {number - FIRST: result.frames_counted for number, result in report.results.items()}
+    assert counted[2] < 1.1 < 2 < min(counted[t] for t in (0, 1, 3, 4))
+    named = [number - FIRST for number, result in report.results.items() if "hardly count" in str(result.warnings)]
+    assert named == [2]
+    assert f"a pixel counts {sum(counted.values()) / 5:.1f} frames" in report.temporal_text
+
+
 def test_the_order_of_a_part_begins_with_its_neighbours():
     frames = {n: FrameFiles(n, None, None, None) for n in (1, 2, 3, 5, 6, 7, 8, 9)}
     plan = ShotPlan(frames, {None: ViewPlan(Reach(1, 1))})

@@ -49,7 +49,7 @@ def host(nodes, monkeypatch, tmp_path):
     nuke.gizmo.setXYpos(40, 200)
     nuke.gizmo["temporal"].setValue("off")  # neighbours take longer, and have a test of their own
     nuke.reads = [nuke.nodes.Read(str(tmp_path / f"{name}.%04d.exr"), 1001, 1003) for name in ("lr", "hr")]
-    for index, read in enumerate(nuke.reads):
+    for index, read in enumerate(reversed(nuke.reads)):  # the HRLS is input 0
         nuke.gizmo.setInput(index, read)
     nuke.frame_number = 1002
     yield nuke

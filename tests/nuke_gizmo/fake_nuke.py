@@ -13,6 +13,7 @@ import queue
 import threading
 import time
 import types
+import weakref
 from pathlib import Path
 
 from oiio_msspl.exr.layers import layers_of
@@ -37,6 +38,7 @@ class Knob:
 
     def setValue(self, val):
         _require_main_thread()
+        Node.nuke.count_change()
         self._value = val
 
     def toScript(self):
@@ -85,6 +87,12 @@ class File_Knob(String_Knob):
         return self.value() or None
 
 
+class Text_Knob(Knob):
+    def setValue(self, val):
+        assert isinstance(val, str)
+        super().setValue(val)
+
+
 class Script_Knob(String_Knob):
     presses = 0
 
@@ -100,7 +108,7 @@ KNOB_TYPES = {
     6: Knob,
     20: Knob,
     22: Script_Knob,
-    26: Knob,
+    26: Text_Knob,
     43: String_Knob,
 }
 _EMPTY = {1: "", 2: "", 3: 0, 6: False, 43: ""}
@@ -170,7 +178,13 @@ class Node:
             for component in layer.channels
         ]
 
-    def metadata(self, key, time):
+    def firstFrame(self):
+        return self["first"].value()
+
+    def lastFrame(self):
+        return self["last"].value()
+
+    def metadata(self, key, time, view="main"):
         """Return the file of a Read at a frame, or an attribute of the file. Frame modes follow Foundry's guide."""
         assert self._kind == "Read"
         if key.startswith("exr/"):
@@ -183,7 +197,7 @@ class Node:
         number = min(
             max(number, self["first"].value()), self["last"].value()
         )  # The modes "before" and "after" are "hold".
-        path = self["file"].value()
+        path = self["file"].value().replace("%V", view).replace("%v", view[0])
         path = path % number if "%" in path else path
         return path if Path(path).exists() else None
 
@@ -218,23 +232,42 @@ class Root(Group):
 
 
 class ProgressTask:
-    made: list[ProgressTask] = []  # noqa: RUF012
+    """Nuke shows the window as long as the object lives. ``made`` keeps what it showed, and a weak reference to it."""
+
+    made: list[types.SimpleNamespace] = []  # noqa: RUF012
     cancel_at: str | None = None
     """The test cancels when this text appears in a message."""
 
     def __init__(self, name):
-        self.name, self.progress, self.messages = name, [], []
-        self.made.append(self)
+        self._shown = types.SimpleNamespace(name=name, progress=[], messages=[], window=weakref.ref(self))
+        self.made.append(self._shown)
 
     def setProgress(self, i):
         assert isinstance(i, int) and 0 <= i <= 100
-        self.progress.append(i)
+        self._shown.progress.append(i)
 
     def setMessage(self, s):
-        self.messages.append(s)
+        self._shown.messages.append(s)
 
     def isCancelled(self):
-        return self.cancel_at is not None and any(self.cancel_at in m for m in self.messages)
+        return self.cancel_at is not None and any(self.cancel_at in m for m in self._shown.messages)
+
+
+class Undo:
+    """The group of changes that one Undo takes back."""
+
+    nuke: FakeNuke
+
+    def begin(self):
+        assert self.nuke.undo_group is None
+        self.nuke.undo_group = ""
+
+    def name(self, name):
+        self.nuke.undo_group = name
+
+    def end(self):
+        self.nuke.undo_steps.append(self.nuke.undo_group)
+        self.nuke.undo_group = None
 
 
 class Menu:
@@ -273,6 +306,8 @@ class FakeNuke(types.ModuleType):
         self._gizmo, self._calls, self._menus = gizmo, queue.Queue(), {}
         self.everything, self.selected, self.messages, self.warnings = [], [], [], []
         Node.nuke = self
+        self.Undo = type("Undo", (Undo,), {"nuke": self})
+        self.undo_group, self.undo_steps, self.view_names = None, [], ["main"]
         self.ProgressTask = type("ProgressTask", (ProgressTask,), {"made": []})
         knobs = [Knob(*pair) for pair in (("first_frame", "", 1), ("last_frame", "", 100), ("proxy", "", False))]
         self._root = Root("Root", "root", knobs)
@@ -285,6 +320,9 @@ class FakeNuke(types.ModuleType):
 
     def root(self):
         return self._root
+
+    def views(self):
+        return list(self.view_names)
 
     def frame(self):
         return self.frame_number
@@ -351,6 +389,11 @@ class FakeNuke(types.ModuleType):
         return self.add(Node(kind, f"{kind}1", [Knob(k, value=v) for k, v in _PLAIN_NODES[kind].items()]))
 
     # For the tests only.
+
+    def count_change(self):
+        """Note a change outside of a group of its own: each is a step for Undo."""
+        if self.undo_group is None:
+            self.undo_steps.append("")
 
     def nodes_of(self, group):
         return [n for n in self.everything if n._parent is group]

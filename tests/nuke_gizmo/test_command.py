@@ -13,7 +13,7 @@ from msspl_bridge.frame_files import FrameFile
 
 
 def test_every_knob_reaches_the_command_line():
-    files = [FrameFile(f"/a/{name}.", 1001, 4, ".exr") for name in ("lr", "hr", "out")]
+    *renders, out = (FrameFile(f"/a/{name}.", 1001, 4, ".exr") for name in ("lr", "hr", "out"))
     settings = Settings(
         model="paper-x4",
         device="cuda",
@@ -23,17 +23,27 @@ def test_every_knob_reaches_the_command_line():
         temporal="off",
         options="--hr-spp 4 --view-layer 'left eye'",
     )
-    one = build_command("msspl-fuse", *files, settings)
-    assert one[:5] == ["msspl-fuse", "/a/lr.1001.exr", "/a/hr.1001.exr", "-o", "/a/out.1001.exr"]
+    still = FrameFile("/a/out.exr")
+    one = build_command("msspl-fuse", [*renders, still], settings)
+    assert one[:5] == ["msspl-fuse", "/a/lr.1001.exr", "/a/hr.1001.exr", "-o", "/a/out.exr"]
     assert " ".join(one[5:]) == (
-        "--device cuda --layout nuke --no-preview --model paper-x4 --map albedo=my albedo --map diffuse=lighting+GI "
-        "--layers crypto* --layers depth --passes light groups --overwrite --hr-spp 4 --view-layer left eye"
+        "--overwrite --model paper-x4 --device cuda --layout nuke --no-preview --map albedo=my albedo "
+        "--map diffuse=lighting+GI --layers crypto* --layers depth --passes light groups --hr-spp 4 --view-layer "
+        "left eye"
     )
-    many = build_command("msspl-fuse", *files, Settings(overwrite=False, temporal="3"), (1001, 1010))
+    many = build_command(
+        "msspl-fuse", [*renders, out], Settings(quality="best", overwrite=False, temporal="3"), (1001, 1010)
+    )
     assert many[1:5] == ["/a/lr.%04d.exr", "/a/hr.%04d.exr", "-o", "/a/out.%04d.exr"]
     assert " ".join(many[5:]) == (
-        "--device cpu --frames 1001-1010 --temporal 3 --progress openjd --layout nuke --no-preview --skip-existing"
+        "--frames 1001-1010 --temporal 3 --progress json --skip-existing --quality best --device cpu --layout nuke "
+        "--no-preview"
     )
+    assert build_command("msspl-fuse", [renders[1], out], Settings())[1:4] == [
+        "/a/hr.%04d.exr",
+        "-o",
+        "/a/out.%04d.exr",
+    ]
 
 
 def test_a_frame_gets_its_neighbours_if_its_files_are_numbered_alike():
@@ -41,7 +51,7 @@ def test_a_frame_gets_its_neighbours_if_its_files_are_numbered_alike():
     lrhs, hrls, out = (FrameFile(f"/a/{name}.", 1001, 4, ".exr") for name in ("lr", "hr", "out"))
 
     def command(*files, **settings):
-        return build_command("msspl-fuse", *files, Settings(**settings))
+        return build_command("msspl-fuse", files, Settings(**settings))
 
     in_shot = command(lrhs, hrls, out, overwrite=False)
     assert in_shot[1:5] == ["/a/lr.%04d.exr", "/a/hr.%04d.exr", "-o", "/a/out.%04d.exr"]
@@ -49,11 +59,11 @@ def test_a_frame_gets_its_neighbours_if_its_files_are_numbered_alike():
     assert "--skip-existing" not in in_shot  # an existing frame is refused, as one that is fused by itself
     still, other = FrameFile("/a/still.exr"), FrameFile("/a/lr.", 5, 4, ".exr")
     for alone in (
-        command(lrhs, hrls, out, temporal="off"),
         command(other, hrls, out),
         command(still, hrls, out),
         command(lrhs, hrls, still),
         command(still, still, still, temporal="2"),
+        command(still, still),
     ):
         assert not {"--frames", "--temporal", "--progress"} & {*alone}
         assert "%" not in "".join(alone)
@@ -70,15 +80,29 @@ def test_a_frame_gets_its_neighbours_if_its_files_are_numbered_alike():
 def test_a_knob_that_cannot_be_parsed_is_named(knobs, sentence):
     file = FrameFile("/a.exr")
     with pytest.raises(FuseError, match=re.escape(sentence)):
-        build_command("msspl-fuse", file, file, file, Settings(**knobs))
+        build_command("msspl-fuse", [file, file], Settings(**knobs))
 
 
 def test_windows_paths_survive_in_the_options(monkeypatch):
     monkeypatch.setattr(os, "sep", "\\")
     file = FrameFile("/a.exr")
     settings = Settings(options=r'--map-file C:\maps\a.toml --report "C:\my reports\r.json"')
-    command = build_command("msspl-fuse", file, file, file, settings)
+    command = build_command("msspl-fuse", [file, file], settings)
     assert command[-4:] == ["--map-file", "C:/maps/a.toml", "--report", "C:/my reports/r.json"]
+
+
+def test_a_job_has_the_options_of_the_range(tmp_path):
+    fuse, msspl = tmp_path / "msspl-fuse", tmp_path / "msspl"
+    files = [FrameFile(f"/a/{name}.", 1001, 4, ".exr") for name in ("hr", "out")]
+    with pytest.raises(FuseError, match=r"there is no msspl beside .*msspl-fuse"):
+        build_command(str(fuse), files, Settings(), (1001, 1010), "/job")
+    msspl.touch(0o755)
+    command = build_command(str(fuse), files, Settings(chunk="20"), (1001, 1010), "/job")
+    assert command[:3] == [str(msspl), "submit", "/a/hr.%04d.exr"]
+    assert " ".join(command[3:]) == (
+        "-o /a/out.%04d.exr --frames 1001-1010 --temporal auto --bundle /job --chunk 20 --update --quality balanced "
+        "--device cpu --layout nuke --no-preview"
+    )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the programs are shell scripts")

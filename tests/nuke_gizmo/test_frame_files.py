@@ -3,7 +3,7 @@
 
 import pytest
 from msspl_bridge.errors import FuseError
-from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output
+from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output, parse_range
 
 
 @pytest.mark.parametrize(
@@ -15,13 +15,13 @@ from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_nu
         ("/a/hr-%04d.exr", "/a/hr-0101.exr", 101, "/a/hr-%04d.exr"),
         ("/a/hr.%04d.exr", "/a/hr.-003.exr", -3, "/a/hr.%04d.exr"),
         ("/a/v2%04d.exr", "/a/v20001.exr", 1, "/a/v2%04d.exr"),
-        ("/%V/hr.%v.%04d.exr", "/left/hr.l.0001.exr", 1, "/left/hr.l.%04d.exr"),
+        ("/%V/hr.%v.%04d.exr", "/left/hr.l.0001.exr", 1, "/%V/hr.%v.%04d.exr"),
         ("/a/still.exr", "/a/still.exr", None, "/a/still.exr"),
     ],
 )
 def test_the_number_is_found_where_the_pattern_has_it(pattern, path, number, back):
     file = find_number(pattern, path)
-    assert (file.number, file.path, file.pattern) == (number, path, back)
+    assert (file.number, file.in_view("left").path, file.pattern) == (number, path, back)
 
 
 def test_a_file_that_does_not_match_the_pattern_is_refused():
@@ -37,8 +37,19 @@ def test_the_output_is_named_after_the_hrls_or_by_the_artist():
     assert name_output("/b/out_##.exr", hrls, 1).path == "/b/out_1001.exr"
     assert name_output("/b/out_##.exr", still, 1).path == "/b/out_01.exr"
     assert name_output("/b/out.exr", hrls, 1).path == "/b/out.exr"
+    stereo = find_number("/%V/hr.%04d.exr", "/left/hr.1001.exr")
+    assert name_output("", stereo, 1).pattern == "/%V/hr_fused.%04d.exr"
+    assert name_output("/b/%v_##.exr", stereo, 1).in_view("right").path == "/b/r_1001.exr"
     with pytest.raises(FuseError, match=r"output out\.exr: is a relative path"):
         name_output("out.exr", hrls, 1)
+
+
+def test_a_range_is_two_frames_or_one():
+    frames = {"1001-1100": range(1001, 1101), "7": range(7, 8), "-5--2": range(-5, -1), "-1-3": range(-1, 4)}
+    assert {text: parse_range(text) for text in frames} == frames
+    for text in ("5-4", "1001-1100x2", "all"):
+        with pytest.raises(FuseError, match=f"range '{text}': write the first and the last frame"):
+            parse_range(text)
 
 
 def test_a_range_is_numbered_as_the_output_files_are():

@@ -66,8 +66,6 @@ def test_a_second_frame_updates_the_same_read(host):
 
 
 def test_a_range_shows_progress_and_comes_back_as_a_read(host, tmp_path):
-    host.gizmo["first"].setValue(1001)
-    host.gizmo["last"].setValue(1003)
     host.gizmo["output"].setValue(str(tmp_path / "out" / "f.%04d.exr"))
     host.press(host.gizmo, "fuse_range")
     host.wait()
@@ -101,8 +99,7 @@ def test_a_frame_fused_with_its_neighbours_has_the_pixels_that_the_range_gives_i
     one = fused("fuse_frame", "one")
     assert len(contents(shot / "one")) == 1
     assert (results(host)[0]["first"].value(), results(host)[0]["last"].value()) == (1003, 1003)
-    host.gizmo["first"].setValue(1002)
-    host.gizmo["last"].setValue(1004)
+    host.gizmo["frames"].setValue("1002-1004")
     assert one == fused("fuse_range", "range")
     host.gizmo["temporal"].setValue("off")
     assert one != alone == fused("fuse_range", "range alone")
@@ -112,8 +109,7 @@ def test_a_reads_frame_expression_is_followed(host, tmp_path):
     """The Reads are shifted in time. The files that Nuke reads are fused, and the result is shifted alike."""
     for read in host.reads:
         read["frame"].setValue("frame+1000")
-    host.gizmo["first"].setValue(2)
-    host.gizmo["last"].setValue(3)
+    host.gizmo["frames"].setValue("2-3")
     host.press(host.gizmo, "fuse_range")
     host.wait()
     assert host.messages == []
@@ -127,19 +123,19 @@ def test_a_read_is_found_through_dots_only(host):
     nuke = host
     dot = nuke.add(Node("Dot", "Dot1", inputs=1))
     dot.setInput(0, nuke.reads[0])
-    nuke.gizmo.setInput(0, dot)
+    nuke.gizmo.setInput(1, dot)
     module = importlib.import_module("msspl_nuke")
-    assert module._find_read(nuke.gizmo, 0, "LRHS") is nuke.reads[0]
+    assert module._find_read(nuke.gizmo, 1, "LRHS") is nuke.reads[0]
     grade = nuke.add(Node("Grade", "Grade1", inputs=1))
     grade.setInput(0, nuke.reads[1])
-    nuke.gizmo.setInput(1, grade)
+    nuke.gizmo.setInput(0, grade)
     nuke.press(nuke.gizmo, "fuse_frame")
-    nuke.gizmo.setInput(1, None)
+    nuke.gizmo.setInput(0, None)
     nuke.press(nuke.gizmo, "fuse_frame")
     assert nuke.messages == [
         "MSSPLFuse1: HRLS is connected to Grade1 (Grade), but MSSPLFuse reads files; connect the Read itself, or write "
         "the image to an EXR and read that",
-        "MSSPLFuse1: nothing is connected to HRLS; connect the Read of that render",
+        "MSSPLFuse1: nothing is connected to HRLS; connect the Read of the render",
     ]
 
 
@@ -157,14 +153,14 @@ def test_a_mistake_is_one_sentence_and_nothing_runs(host, tmp_path):
 
     assert pressed(program="/nowhere").startswith("the program knob names /nowhere, but there is no such program")
     assert pressed(mapping="albedo").startswith("mapping 'albedo': write one feature=layer per line")
-    assert pressed("fuse_range", first=5, last=4).startswith("the range 5 to 4 is empty")
-    assert pressed("fuse_range", first=1001, last=1005).startswith(
+    assert pressed("fuse_range", frames="5-4").startswith("range '5-4': write the first and the last frame")
+    assert pressed("fuse_range", frames="1001-1005").startswith(
         "Read1 does not have one numbered file per frame from 1001 to 1005"
     )
     one_file = str(tmp_path / "out.exr")
-    assert "a range needs a frame number in the name" in pressed("fuse_range", first=1001, last=1003, output=one_file)
+    assert "a range needs a frame number in the name" in pressed("fuse_range", output=one_file)
     host.reads[0]["frame"].setValue("frame-1")
-    assert "for a range, both need the same numbers" in pressed("fuse_range", first=1002, last=1003)
+    assert "for a range, both need the same numbers" in pressed("fuse_range", frames="1002-1003")
     host.root()["proxy"].setValue(True)
     assert pressed().startswith("proxy mode is on; turn it off")
     host.root()["proxy"].setValue(False)
@@ -179,15 +175,13 @@ def test_an_error_of_msspl_fuse_is_shown_as_one_sentence(host, tmp_path):
     host.press(host.gizmo, "fuse_frame")
     host.wait()
     (message,) = host.messages
-    assert message.startswith(f"MSSPLFuse1: {tmp_path}/lr.1002.exr: ")
+    assert message.startswith(f"MSSPLFuse1: frame 1002: {tmp_path}/lr.1002.exr: ")
     assert "\n" not in message
     assert results(host) == []
 
 
 def test_a_bad_frame_does_not_stop_the_range(host, tmp_path):
     (tmp_path / "lr.1002.exr").write_bytes(b"not an EXR")
-    host.gizmo["first"].setValue(1001)
-    host.gizmo["last"].setValue(1003)
     host.press(host.gizmo, "fuse_range")
     host.wait()
     (message,) = host.messages
@@ -201,8 +195,6 @@ def test_cancelling_keeps_finished_frames_and_leaves_no_half_written_file(host, 
         read["last"].setValue(1020)
         for frame in range(1004, 1021):
             shutil.copy(EXAMPLES / f"{name}.exr", tmp_path / f"{name}.{frame}.exr")
-    host.gizmo["first"].setValue(1001)
-    host.gizmo["last"].setValue(1020)
     host.ProgressTask.cancel_at = "1 of 20"
     host.press(host.gizmo, "fuse_range")
     host.wait()
@@ -240,7 +232,7 @@ def test_copy_to_group_keeps_name_knobs_and_connections_and_its_buttons_work(hos
     importlib.import_module("msspl_nuke").copy_to_group()
     group = viewer.input(0)
     assert (group.Class(), group.name(), group["layers"].value()) == ("Group", "MSSPLFuse1", "none")
-    assert [group.input(i) for i in range(2)] == host.reads
+    assert [group.input(i) for i in range(2)] == host.reads[::-1]
     assert (group.xpos(), group.ypos()) == (40, 200)
     assert host.gizmo not in host.everything
     host.press(group, "fuse_frame")
@@ -250,9 +242,9 @@ def test_copy_to_group_keeps_name_knobs_and_connections_and_its_buttons_work(hos
 
 def test_a_button_without_the_module_says_what_to_install(host, monkeypatch):
     monkeypatch.setitem(sys.modules, "msspl_nuke", None)
-    for button in ("fuse_frame", "fuse_range", "rebuild"):
+    for button in ("fuse_frame", "fuse_range", "submit_range", "rebuild"):
         host.press(host.gizmo, button)
-    assert len(host.messages) == 3
+    assert len(host.messages) == 4
     for message in host.messages:
         assert message.startswith("This button needs the folder nuke_gizmo of oiio_msspl on the plug-in path of Nuke.")
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.image.arrays import Array, Mask
-from oiio_msspl.image.filters import grown, sum_3x3
+from oiio_msspl.image.filters import grown, means_around, sum_3x3
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices
 
@@ -23,8 +23,11 @@ from oiio_msspl.image.sampling import nearest_indices
 DIFFERENCE, MULTIPLE = 0.03, 3.0
 #: The surface is another one if this many of 3 x 3 pixels differ. Single ones are noise.
 PIXELS = 4
+#: It is also another one where most pixels differ, up to this number of rows and columns away: a texture that has moved
+#: has the same colour here and there by chance.
+AROUND, MOST = 8, 0.5
 #: Rows and columns around a pixel that decide on it.
-REACH = 4
+REACH = 4 + AROUND
 #: Pixels by which vectors are judged, at most, and at least.
 MOST_SAMPLES, FEWEST_SAMPLES = 16384, 64
 #: Vectors are judged where they are longer than this, in pixels.
@@ -120,7 +123,7 @@ def _at_places(
     x = np.arange(area.x0, area.x1, dtype=np.float32) + vectors[..., 0]
     y = np.arange(area.y0, area.y1, dtype=np.float32)[:, None] + vectors[..., 1]
     inside = (x > window.x0 - 0.5) & (x < window.x1 - 0.5) & (y > window.y0 - 0.5) & (y < window.y1 - 0.5) & known
-    ends = (np.rint(y[inside].min()), np.rint(y[inside].max())) if inside.any() else (window.y0, window.y0)
+    ends = (np.floor(y[inside].min()), np.ceil(y[inside].max())) if inside.any() else (window.y0, window.y0)
     first, last = (min(max(int(end), window.y0), window.y1 - 1) for end in ends)
     place = Window(window.x0, first, window.x1, last + 1)
     nearest = nearest_indices(x - place.x0, y - place.y0, (place.height, place.width))
@@ -147,6 +150,7 @@ def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Ma
             limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + np.float32(DIFFERENCE)
             differs = (_distance(one, two) > limit) & compared[around]
             other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
+        other |= means_around(other.astype(np.float32), [AROUND])[0] > MOST
         result[rows] = grown(other)[first - around.start :][: last - first]
 
     for_row_blocks(work, height, width)

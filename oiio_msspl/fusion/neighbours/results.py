@@ -59,6 +59,8 @@ class ResultBand:
         warped = _warp(hop.frame, path)
         picture = to_grid(alignment, np.where(path.valid[..., None], warped[RGB], self._own[RGB]), area)
         weight = from_grid(alignment, judge(picture), area) * path.valid
+        if path.x is not None:
+            weight *= self._light.moved_weight
         mixed = self._borders | _borders_at(hop, path)
         here, there = (luminance(images[RGB][mixed]) for images in (self._own, warped))
         weight[mixed] *= likeness(here, there, self._light.darkest, DIFFERENT_MIX)

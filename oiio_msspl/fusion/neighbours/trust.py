@@ -48,6 +48,9 @@ LARGEST_DIFFERENCE = 3.0
 DARKEST = 0.02
 #: Relative squared difference below which two frames are equal.
 EQUAL = 1e-4
+#: Variance of the noise of an HRLS pixel, relative to the light, up to which a neighbour that has moved does not count,
+#: and from which on it counts fully: 400 and 250 spp. In clean frames it could only blur.
+CLEAN, NOISY = 1 / 400, 1 / 250
 #: A lamp shines in one frame alone where the mean of 3 x 3 LRHS pixels is this many times as bright as the brightest of
 #: them in the other frame.
 LAMP = 3.0
@@ -80,6 +83,9 @@ class Light(ABC):
         self._noise = self.cells(_noise(lrhs, hrls, bright)) / np.float32(4**self._halvings)
         self.noise = float(np.median(self._noise)) * 4**self._halvings
         """Variance of the mean of both renders in an LRHS pixel, relative to the light: the median of all."""
+        hrls_noise = 2 * self.noise * alignment.scale**2
+        self.moved_weight = np.float32(np.clip((hrls_noise - CLEAN) / (NOISY - CLEAN), 0, 1))
+        """How much a neighbour that has moved counts, from 0 to 1."""
         self.shape = self._noise.shape
         """Rows and columns of cells."""
         self._share = self.cell**2 / PIXELS_AVERAGED

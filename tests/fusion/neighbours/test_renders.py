@@ -143,7 +143,7 @@ def test_clean_renders_keep_their_detail_where_a_surface_lies_between_pixels():
     for shift in (0.0, 0.4, 0.8):
         stripes = (0.5 + 0.08 * np.sin((x - shift) * np.pi / 2.5))[None, :, None]
         truth = np.broadcast_to(stripes, (HEIGHT, WIDTH, 3)).astype(np.float32)
-        noise = [np.random.default_rng(int(10 * shift)).normal(1, 0.02 / k, truth[::k, ::k].shape) for k in (1, SCALE)]
+        noise = [np.random.default_rng(int(10 * shift)).normal(1, 0.1 / k, truth[::k, ::k].shape) for k in (1, SCALE)]
         hr = Render.from_arrays("hr", rgb=(truth * noise[0]).astype(np.float32), albedo=truth.copy())
         lr = Render.from_arrays("lr", rgb=(box_downsample(truth, SCALE) * noise[1]).astype(np.float32))
         pairs.append((RenderPair(lr, hr), truth))
@@ -152,6 +152,34 @@ def test_clean_renders_keep_their_detail_where_a_surface_lies_between_pixels():
     own = pairs[0][0].hr.layers
     assert rms(result.hr.layers["rgb"], pairs[0][1], inside) < rms(own["rgb"], pairs[0][1], inside)
     assert np.array_equal(result.hr.layers["albedo"], own["albedo"])
+
+
+def test_a_frame_without_noise_is_not_blurred_by_neighbours_that_moved():
+    """A neighbour that stands still can't blur it."""
+    truth = texture()
+    lr, hr = Render.from_arrays("lr", rgb=box_downsample(truth, SCALE)), Render.from_arrays("hr", rgb=truth)
+    pair = RenderPair(lr, hr)
+    result = average_renders(pair, [moved(pair, 0.3)], [moved(pair, 0.3)])
+    assert np.array_equal(result.hr.layers["rgb"], truth) and np.array_equal(result.lr.layers["rgb"], lr.layers["rgb"])
+    assert average_renders(pair, [still(pair)], [still(pair)]).frames.mean() > 2.9
+
+
+def test_neighbours_that_moved_by_half_a_pixel_give_each_pixel_another_sample():
+    """Noise that two pixels share looks like detail to a network."""
+    pairs = [pair_of(texture(shift), seed) for seed, shift in enumerate((0.0, 0.5))]
+    noise = average_renders(pairs[0], [moved(pairs[1], 0.5)], []).hr.layers["rgb"][..., 0] / texture()[..., 0] - 1
+    inside = noise[:, 8:-8]
+    assert abs(np.mean(inside[:, 1:] * inside[:, :-1]) / inside.var()) < 0.05
+
+
+def test_pixels_far_around_an_object_that_is_not_followed_count_less():
+    """Where less noise meets more of it, a network smooths neither as it should."""
+    pairs = [pair_of(texture(), seed) for seed in range(2)]
+    objects = np.zeros((HEIGHT, WIDTH), bool)
+    objects[36:60, 52:76] = True
+    frames = average_renders(pairs[0], [hop(pairs[1], known=~objects, moved_objects=objects)], []).frames[..., 0]
+    assert (frames[objects] == 1).all()
+    assert frames[48, 84] < 1.2 < 1.8 < frames[48, 4]
 
 
 def test_a_small_lamp_in_the_neighbour_leaves_no_ghost():

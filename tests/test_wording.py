@@ -15,7 +15,7 @@ from oiio_msspl.findings import Finding
 from tests.shots import make_shot
 
 #: Options of other programs, and those that a job's template holds.
-OTHERS = {"--nthreads", "--short", "--html", "--progress", "--output", "--components", "--scale"}
+OTHERS = {"--nthreads", "--short", "--html", "--progress", "--output", "--components", "--scale", "--no-preview"}
 
 
 @pytest.fixture

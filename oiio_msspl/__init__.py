@@ -28,13 +28,19 @@ if TYPE_CHECKING:
     from oiio_msspl.exr.reader import open_exr
     from oiio_msspl.exr.render import Render, Window
     from oiio_msspl.exr.write_options import WriteOptions
+    from oiio_msspl.findings import Finding
     from oiio_msspl.fusion.fuse import FusedFrame, fuse
+    from oiio_msspl.inspection import Inspection, inspect_file
     from oiio_msspl.jobs.arrays import fuse_arrays
+    from oiio_msspl.jobs.farm.openjd import Job, make_job, write_bundle
     from oiio_msspl.jobs.files import fuse_files
     from oiio_msspl.jobs.inputs import InputOptions
+    from oiio_msspl.jobs.pair_check import PairCheck, check_files
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.report import FrameReport
+    from oiio_msspl.jobs.sequence import Shot, find_shot
     from oiio_msspl.jobs.shot import fuse_shot
+    from oiio_msspl.jobs.shot_check import ShotCheck, check_shot
     from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
     from oiio_msspl.model.catalogue import find_model, shipped_models
     from oiio_msspl.model.contract import Contract
@@ -42,53 +48,77 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "Contract": "model.contract",
+    "Finding": "findings",
     "FrameReport": "jobs.report",
     "FrameResult": "jobs.shot_report",
     "FusedFrame": "fusion.fuse",
     "InputError": "errors",
     "InputOptions": "jobs.inputs",
+    "Inspection": "inspection",
+    "Job": "jobs.farm.openjd",
     "MappedRender": "aovs.mapped_render",
     "MssplError": "errors",
+    "PairCheck": "jobs.pair_check",
     "Render": "exr.render",
     "Session": "model.session",
+    "Shot": "jobs.sequence",
+    "ShotCheck": "jobs.shot_check",
     "ShotReport": "jobs.shot_report",
     "TemporalOptions": "jobs.plan",
     "Window": "exr.render",
     "WriteOptions": "exr.write_options",
+    "check_files": "jobs.pair_check",
+    "check_shot": "jobs.shot_check",
     "find_model": "model.catalogue",
+    "find_shot": "jobs.sequence",
     "fuse": "fusion.fuse",
     "fuse_arrays": "jobs.arrays",
     "fuse_files": "jobs.files",
     "fuse_shot": "jobs.shot",
+    "inspect_file": "inspection",
+    "make_job": "jobs.farm.openjd",
     "map_render": "aovs.matching",
     "open_exr": "exr.reader",
     "shipped_models": "model.catalogue",
+    "write_bundle": "jobs.farm.openjd",
 }
 
 __all__ = [
     "Contract",
+    "Finding",
     "FrameReport",
     "FrameResult",
     "FusedFrame",
     "InputError",
     "InputOptions",
+    "Inspection",
+    "Job",
     "MappedRender",
     "MssplError",
+    "PairCheck",
     "Render",
     "Session",
+    "Shot",
+    "ShotCheck",
     "ShotReport",
     "TemporalOptions",
     "Window",
     "WriteOptions",
     "__version__",
+    "check_files",
+    "check_shot",
     "find_model",
+    "find_shot",
     "fuse",
     "fuse_arrays",
     "fuse_files",
     "fuse_shot",
+    "inspect_file",
+    "make_job",
     "map_render",
     "open_exr",
     "shipped_models",
+    "write_bundle",
 ]
 
 

@@ -19,15 +19,18 @@ from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.findings import Finding, as_data
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.motion.source import MotionSource, find_motion
 from oiio_msspl.fusion.passes.sums import check_sum
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.features import SIGNED_FEATURES
+from oiio_msspl.jobs.advice import advise
 from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
 from oiio_msspl.jobs.sequence import is_sequence, next_file
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.wording import worded
 
 
 @dataclass
@@ -53,6 +56,8 @@ class Inspection:
     """Additive sets of all views that sum to their beauty."""
     unused: list[str] = field(default_factory=list)
     """Names of the layers and channels that are neither read nor fused."""
+    advice: list[Finding] = field(default_factory=list)
+    """What more would help, and what it costs, by :func:`inspect_noise`."""
     problems: list[str] = field(default_factory=list)
     """Reasons why the file can't be used, one sentence each; empty if it can."""
 
@@ -123,6 +128,7 @@ class Inspection:
                 "unused": self.unused,
                 "motion_layers": {vectors.name: str(vectors.format) for vectors in self.render.motion.fields},
                 "noise": self.noise,
+                "advice": [as_data(text) for text in self.advice],
                 "motion": {"kind": self.motion.kind, "text": self.motion.text} if self.motion else None,
             }
         return result
@@ -176,7 +182,7 @@ def inspect_file(
 
 
 def inspect_noise(inspections: Sequence[Inspection]) -> None:
-    """Add to a render, or to the larger of a frame's two, the fact whether the pixel filter has spread the noise.
+    """Add to a render, or to the larger of a frame's two, whether the pixel filter has spread the noise, and advice.
 
     Nothing is added if there are more files, or the two are no pair.
     """
@@ -186,6 +192,7 @@ def inspect_noise(inspections: Sequence[Inspection]) -> None:
     (lr, low), (hr, high) = sorted(2 * renders if len(renders) == 1 else renders, key=_width)
     try:
         spread = is_noise_spread(lr, hr, align(lr, hr))
+        high.advice = advise(lr, hr, spread, in_shot=next_file(high.path) is not None)
     except InputError:
         return
     if spread is None:
@@ -280,7 +287,7 @@ def _pixel_facts(render: MappedRender) -> list[str]:
     if brightest[RGB] == 0:
         bright = ", ".join(name for name, value in brightest.items() if value > 0 and name != "alpha")
         hint = f", though others are not: {bright}; check which layer it is (--map rgb=LAYER)" if bright else ""
-        render.notes.append(f"the beauty is black everywhere{hint}")
+        render.notes.append(worded(f"the beauty is black everywhere{hint}"))
     counts = [f"{name}: {n} values are NaN or infinite; fusing repairs them" for name, n in not_finite.items() if n]
     for name, count in negative.items():
         if count:

@@ -35,6 +35,7 @@ from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import Array
+from oiio_msspl.wording import worded
 
 #: Bands of rows that tell whether normals are signed, and rows of a band.
 _BANDS_OF_NORMALS, _ROWS_PER_BAND = 8, 8
@@ -199,10 +200,11 @@ def _drop_unusable_variance(render: MappedRender) -> None:
     formula = render.features.get(VARIANCE)
     if formula is not None and formula.kind in NEEDS_SPP and not render.spp:
         del render.features[VARIANCE]
-        render.notes.append(
+        text = (
             f"variance: '{formula.text}' is {formula.kind.replace('_', ' ')}, which needs the samples per pixel; "
-            "the header does not say, so it is not used (give --hr-spp to msspl-fuse)"
+            "the header does not say, so it is not used (--hr-spp says them)"
         )
+        render.notes.append(worded(text))
 
 
 def _decide_normal_encoding(render: MappedRender) -> None:

@@ -35,6 +35,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import channel_names, write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
 from oiio_msspl.exr.write_options import OPTIONS, WriteOptions
+from oiio_msspl.findings import Finding
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.parallel import one_ahead
 
@@ -53,7 +54,7 @@ def write_fused(
     overwrite: bool = False,
     cache_bytes: int = 0,
     before_rename: Callable[[], object] | None = None,
-) -> list[str]:
+) -> list[Finding]:
     """Write the fused frame to ``path``, atomically.
 
     Args:
@@ -78,8 +79,8 @@ def write_fused(
         MssplError: the file can't be written; a file at ``path`` is untouched.
     """
     dropped = dropped_channels(source, beauty, options.layers)
-    warnings = [
-        f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
+    warnings: list[Finding] = [
+        Finding("deep", f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on")
         for part in source.parts
         if part.deep
     ]
@@ -99,11 +100,14 @@ def write_fused(
     return warnings
 
 
-def _replace_alpha(replaced: ReplacedChannels, source: ExrFile, beauty: Sequence[Channel], alpha: Array) -> list[str]:
+def _replace_alpha(
+    replaced: ReplacedChannels, source: ExrFile, beauty: Sequence[Channel], alpha: Array
+) -> list[Finding]:
     """Put the alpha of another part where it was. Return a warning if that part has another data window."""
     channel = beauty[-1]
     if source.parts[channel.part].data_window != source.parts[beauty[0].part].data_window:
-        return ["the alpha has another data window than the beauty, so it is passed on as it is"]
+        text = "the alpha has another data window than the beauty, so it is passed on as it is"
+        return [Finding("no_alpha", text)]
     replaced.add([channel], alpha.shape[1], alpha.shape[0])
     replaced.put(channel, 0, alpha[..., 0])
     return []

@@ -14,6 +14,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.replaced import ReplacedChannels
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.checks.averages import HrlsAverages, bounded_luminance
 from oiio_msspl.fusion.checks.pair import Judgement, check_pair
 from oiio_msspl.fusion.passes.fuse import FusedPasses
@@ -42,7 +43,7 @@ class FusedFrame(FusedPixels):
     """(height, width, 1): number of frames that were averaged; None without neighbours."""
     negative: dict[str, int] = field(default_factory=dict)
     """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Finding] = field(default_factory=list)
     """One sentence each."""
     passes: FusedPasses | None = None
     """The fused layers of additive sets; None if there are none."""
@@ -145,7 +146,7 @@ def fuse(
     frame.warnings += _lost_aovs(frame)
     frame.seconds = session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
-        frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
+        frame.warnings.append(Finding("no_alpha", "the LRHS has no alpha, so the noisy alpha of the HRLS is kept"))
     return frame
 
 
@@ -163,11 +164,15 @@ def check_model(session: Session, scale: int, *, error: bool) -> None:
         raise InputError(f"model {name} is for x{session.contract.scale}, but this pair is x{scale}{hint}")
 
 
-def _lost_aovs(frame: FusedFrame) -> list[str]:
+def _lost_aovs(frame: FusedFrame) -> list[Finding]:
     """Return a sentence for each AOV of the HRLS that is broken in most of its values."""
     broken = {name: frame.repaired.get(f"hrls.{name}", 0) / frame.rgb.size for name in (ALBEDO, NORMAL)}
     return [
-        f"{fraction:.0%} of the HRLS's {name} is NaN or infinite, so it tells little of the surfaces; render it again"
+        Finding(
+            "broken_aov",
+            f"{fraction:.0%} of the HRLS's {name} is NaN or infinite, so it tells little of the surfaces; "
+            "render it again",
+        )
         for name, fraction in broken.items()
         if fraction > 0.5
     ]

@@ -16,6 +16,7 @@ from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.layers import Layer
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.motion.source import VECTORS, MotionSource
 from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS
 from oiio_msspl.fusion.tiles.alignment import Alignment
@@ -99,7 +100,7 @@ class RenderedShot:
         #: Renders on the disk, by frame number.
         self._renders: dict[int, FrameFiles] = {}
         #: Warnings about the frames that are written.
-        self._warnings: dict[Path, list[str]] = {}
+        self._warnings: dict[Path, list[Finding]] = {}
         frames = {files.number: files for files in shot}
         # Every neighbour must be rendered, so `best` takes no more of them than other models.
         count = options.count()
@@ -277,7 +278,7 @@ class RenderedShot:
         """Return whether a frame is rendered, and waits for its neighbours."""
         return output not in self._warnings and any(frame.output == output for frame in self._renders.values())
 
-    def warnings(self, output: Path) -> list[str]:
+    def warnings(self, output: Path) -> list[Finding]:
         """Return the warnings about a frame that is written."""
         return self._warnings.get(output, [])
 

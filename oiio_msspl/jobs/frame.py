@@ -14,6 +14,7 @@ from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.source import MotionFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
@@ -60,7 +61,7 @@ class ShotFrame:
     state: State = State.FOUND
     error: Exception | None = None
     """Why it did not come further."""
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Finding] = field(default_factory=list)
     """What is wrong with its neighbours, one sentence each."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time by what it was spent on: ``read`` and ``fuse``."""

@@ -19,6 +19,7 @@ from oiio_msspl.aovs.motion import MotionField, read_format
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
 from oiio_msspl.jobs.inputs import InputOptions, MappedPair, map_other_hrls, map_pair
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
@@ -26,6 +27,7 @@ from oiio_msspl.jobs.settings import family_for_layers
 from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline, neighbours
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of
+from oiio_msspl.wording import worded
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +91,11 @@ class ShotPlan:
     """One sentence for the user; empty if the user has switched it off."""
     looked_at: frozenset[str] = frozenset()
     """All views beside the first one that were planned. ``text`` says why some are fused frame by frame."""
+
+    @property
+    def warnings(self) -> list[Finding]:
+        """A warning if neighbours were wanted, and each frame is fused alone."""
+        return [Finding("not_averaged", self.text)] if self.text and not self.count else []
 
     @property
     def count(self) -> int:
@@ -160,7 +167,7 @@ def plan_temporal(
     count = options.count(_family_of_shot(mapped, frames, model))
     plan, text = _plan_view(_motion_of(mapped, numbers, inputs, options, required=asked), count, asked=asked)
     if plan is None:
-        return ShotPlan(text=text)
+        return ShotPlan(text=worded(text))
     views: dict[str | None, ViewPlan] = {None: plan}
     labels = _other_views(mapped, numbers[:PAIRS_JUDGED], inputs, write)
     for label in labels:
@@ -170,7 +177,7 @@ def plan_temporal(
             text += f"; {name_of(label)} {reason}"
         else:
             views[label] = plan
-    return ShotPlan(frames, views, text, frozenset(labels))
+    return ShotPlan(frames, views, worded(text), frozenset(labels))
 
 
 def _family_of_shot(mapped: Callable[[int], MappedPair], numbers: Iterable[int], model: str | None) -> str | None:

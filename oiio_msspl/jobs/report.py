@@ -20,6 +20,7 @@ from oiio_msspl.aovs.views import name_of
 from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.layers import layer_by_channel, layers_of
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.findings import Finding, codes_of
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import ONE_SIZE, Contract
 from oiio_msspl.model.digests import as_text
@@ -52,7 +53,8 @@ class FrameReport:
     """Number of values that were NaN or infinite, by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
     negative: dict[str, int]
     """Number of values that were negative and set to 0, by layer."""
-    warnings: list[str]
+    warnings: list[Finding]
+    """What is wrong with the frame. Each is a sentence with a ``code``, see :data:`oiio_msspl.findings.CODES`."""
     tiles: int
     """Tiles of all views that were fused."""
     seconds: dict[str, float]
@@ -146,6 +148,7 @@ class FrameReport:
             "clipped": self.clipped,
             "trust": None if self.trust is None else round(self.trust, 4),
             "warnings": self.warnings,
+            "warning_codes": codes_of(self.warnings),
             "frames_counted": None if self.frames_counted is None else round(self.frames_counted, 2),
             "tiles": self.tiles,
             "seconds": {k: round(v, 3) for k, v in self.seconds.items()},
@@ -187,7 +190,7 @@ def report_on(
     )
 
 
-def add_other_views(report: FrameReport, views: Sequence[FrameReport], passed_on: Sequence[str]) -> None:
+def add_other_views(report: FrameReport, views: Sequence[FrameReport], passed_on: Sequence[Finding]) -> None:
     """Add the reports of other views to that of the first one, and sentences on why further views are passed on."""
     report.warnings = [*merged({view.hr.view: view.warnings for view in (report, *views)}), *passed_on]
     report.other_views = list(views)
@@ -200,22 +203,25 @@ def add_other_views(report: FrameReport, views: Sequence[FrameReport], passed_on
         report.network_seconds += view.network_seconds
 
 
-def merged(sentences: Mapping[str, Sequence[str]]) -> list[str]:
+def merged(sentences: Mapping[str, Sequence[Finding]]) -> list[Finding]:
     """Merge the sentences about several views. One that only some views share begins with the names of these."""
-    views: dict[str, list[str]] = {}
+    views: dict[Finding, list[str]] = {}
     for view, texts in sentences.items():
         for text in texts:
             views.setdefault(text, []).append(name_of(view))
-    return [text if len(who) == len(sentences) else f"{', '.join(who)}: {text}" for text, who in views.items()]
+    return [text if len(who) == len(sentences) else text.about(", ".join(who)) for text, who in views.items()]
 
 
-def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[str]:
+def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[Finding]:
     """Warn of layers that the LRHS lacks, and of sets that the user has named and that could not be fused."""
     if fused.passes is None:
         return []
     refused = fused.passes.refused
     named = [additive.name for additive in hr.additive_sets if additive.by_user and additive.name in refused]
-    passed_on = [f"--sum {name}: {refused[name]}; its layers of {hr.name} are passed on as they are" for name in named]
+    passed_on = [
+        Finding("passes", f"--sum {name}: {refused[name]}; its layers of {hr.name} are passed on as they are")
+        for name in named
+    ]
     return [*fused.passes.warnings, *passed_on]
 
 
@@ -232,28 +238,34 @@ def _passes(fused: FusedFrame) -> dict[str, str]:
     return texts | refused
 
 
-def _aov_warnings(hr: MappedRender, contract: Contract) -> list[str]:
+def _aov_warnings(hr: MappedRender, contract: Contract) -> list[Finding]:
     """Warn if the model reads an albedo and there is none."""
     if ALBEDO not in contract.hrls or ALBEDO in hr.features:
         return []
-    return ["no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"]
+    text = "no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"
+    return [Finding("no_albedo", text)]
 
 
-def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:
+def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[Finding]:
     """Warn of samples per pixel that the method or the model was not made for."""
     if contract.scale == ONE_SIZE:
         return []
     warnings = []
     if lr.spp is not None and hr.spp is not None and lr.spp / contract.scale**2 < LEAST_SHARE * hr.spp:
         warnings.append(
-            f"the LRHS has {lr.spp:g} spp and the HRLS {hr.spp:g}: the method expects more in the low-resolution render"
+            Finding(
+                "spp",
+                f"the LRHS has {lr.spp:g} spp and the HRLS {hr.spp:g}: the method expects more in the low-resolution "
+                "render",
+            )
         )
     for name, key, spp in (("HRLS", "hrls", hr.spp), ("LRHS", "lrhs", lr.spp)):
         trained = contract.training_spp.get(key)
         # Where a network saw fewer samples, it removes detail, which the renders give back to all but the paper's.
         most = math.inf if contract.denoiser or trained is None else trained[1]
         if spp is not None and trained and not trained[0] <= spp <= most:
-            warnings.append(f"the {name} has {spp:g} spp; {contract.name} was trained on {trained[0]} to {trained[1]}")
+            text = f"the {name} has {spp:g} spp; {contract.name} was trained on {trained[0]} to {trained[1]}"
+            warnings.append(Finding("spp", text))
     return warnings
 
 

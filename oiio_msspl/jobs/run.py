@@ -20,6 +20,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
 from oiio_msspl.fusion.motion.shot import ShotMotion
 from oiio_msspl.fusion.motion.source import MotionFrame
@@ -115,7 +116,10 @@ class ShotRun:
     def _average_renders(self, frame: ShotFrame) -> None:
         """Average the renders of a frame with those of its neighbours."""
         missing = self.plan.missing(frame.number)
-        frame.warnings += [f"frame {number} is missing, so fewer neighbours are averaged" for number in missing]
+        frame.warnings += [
+            Finding("missing_neighbour", f"frame {number} is missing, so fewer neighbours are averaged")
+            for number in missing
+        ]
         if frame.error is not None:
             return
         frame.session = self.settings.session(align(frame.lr, frame.hr).scale)
@@ -220,7 +224,8 @@ class ShotRun:
         report = report_on(first.lr, first.hr, first.session, picture, first.files.output, first.files.preview)
         report.layers = written_layers(first.hr, first.write)
         views = sorted(others, key=lambda other: first.hr.other_views.index(other.hr.view))
-        add_other_views(report, [view.report for view in views], [*first.passed_on, *self._unplanned_views(first)])
+        passed_on = [Finding("view_not_fused", text) for text in first.passed_on]
+        add_other_views(report, [view.report for view in views], [*passed_on, *self._unplanned_views(first)])
         return report
 
     def _average_results(self, frame: ShotFrame) -> FusedFrame:
@@ -256,11 +261,12 @@ class ShotRun:
         picture.replaced = picture.passes.pixels
         session.release_layer_memory()
 
-    def _unplanned_views(self, first: ShotFrame) -> list[str]:
+    def _unplanned_views(self, first: ShotFrame) -> list[Finding]:
         """Return a sentence for each view that is fused frame by frame because the plan does not know it."""
         names = [view.hr.view for view in first.others if self.plan.count]
         new = [name_of(name) for name in names if name not in self.plan.looked_at]
-        return [f"{name} is fused frame by frame: the frames by which its motion is found lack it" for name in new]
+        why = "is fused frame by frame: the frames by which its motion is found lack it"
+        return [Finding("not_averaged", f"{name} {why}") for name in new]
 
     def _hops_of_renders(self, frame: ShotFrame) -> list[list[Hop[RenderPair]]]:
         """Return the hops to the neighbours before and after a frame whose renders are averaged with its own."""

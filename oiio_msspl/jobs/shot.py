@@ -32,6 +32,7 @@ from oiio_msspl.jobs.sequence import FrameFiles, Shot, find_shot
 from oiio_msspl.jobs.settings import Settings, bytes_of
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.model.devices import require_device
+from oiio_msspl.wording import worded
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -116,13 +117,15 @@ def fuse_shot(
         plan = plan_temporal(shot, inputs, temporal, model, write)
     skip, memory = skip_existing or update, bytes_of(max_memory)
     settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update, strict)
-    report = ShotReport(shot, temporal=plan.text, neighbours=plan.count)
+    report = ShotReport(shot, temporal=plan.text, neighbours=plan.count, warnings=plan.warnings)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
     make_output(shot)
     running = _RunningReport(report, path, progress, start)
     existing = ExistingResults(settings, plan)
     if odd := existing.dated_in_future(shot.frames):
-        log.warning("%s: is dated in the future, so --update can't tell what is newer; set its date (touch)", odd)
+        log.warning(
+            worded(f"{odd}: is dated in the future, so --update can't tell what is newer; set its date (touch)")
+        )
     to_fuse = running.add_known(existing, earlier)
     if to_fuse:
         with limit_threads(threads):

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from oiio_msspl._version import full_version
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, replacing
+from oiio_msspl.findings import Finding, codes_of
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.model.digests import as_text
 
@@ -25,6 +25,9 @@ FIRST_FUSED = {
     *("aovs", "layers", "notes", "passes"),
 }
 
+#: What a frame's result has of its report, beside warnings.
+_OF_FRAME = ("aovs", "layers", "passes", "repaired", "seconds", "frames_counted")
+
 #: A frame stands alone if a pixel counts fewer frames than this, in the mean.
 ALONE = 1.1
 
@@ -34,8 +37,8 @@ MOST_NAMES = 6
 #: Bytes of the largest file that is read as an earlier report. A frame takes one or two thousand.
 LARGEST_REPORT = 128 << 20
 
-#: The warning of :func:`older_than`.
-_OLDER = re.compile(r"is older than .*; --update fuses such frames again", re.DOTALL)
+#: The code of the warning of :func:`older_than`.
+OLDER = "older"
 
 FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
 
@@ -51,7 +54,14 @@ class FrameResult:
     """Why the frame was not fused."""
     exit_code: int = 0
     """0, 2 for the caller's mistake, or 1 for any other failure."""
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Finding] = field(default_factory=list)
+    """What is wrong with it. Each is a sentence with a ``code``, see :data:`oiio_msspl.findings.CODES`."""
+    aovs: list[dict[str, str]] = field(default_factory=list)
+    """What the features of the HRLS were read from: ``feature``, ``status``, ``source`` and ``note``."""
+    layers: list[str] = field(default_factory=list)
+    """The layers that were written beside the beauty, see :attr:`.FrameReport.layers`."""
+    passes: dict[str, str] = field(default_factory=dict)
+    """What was done with each set of passes, by name."""
     repaired: dict[str, int] = field(default_factory=dict)
     """Number of values that were NaN or infinite, by layer."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -61,6 +71,11 @@ class FrameResult:
     lrhs: str | None = None
     hrls: str | None = None
     output: str = ""
+
+    @property
+    def codes(self) -> list[str]:
+        """The code of each warning."""
+        return codes_of(self.warnings)
 
 
 @dataclass(repr=False)
@@ -83,11 +98,18 @@ class ShotReport:
     """A sentence on the neighbours that frames are averaged with, and how motion is known; empty if switched off."""
     neighbours: int = 0
     """Frames before and after a frame that it is averaged with."""
+    warnings: list[Finding] = field(default_factory=list)
+    """What is wrong with the whole shot; those of a frame are in its result."""
 
     def __repr__(self) -> str:
         """Return one line; :meth:`as_dict` has everything."""
         counts = Counter(result.status for result in self.results.values())
         return f"<{self.shot.output}: {', '.join(f'{counts[status]} {status}' for status in counts) or 'no frames'}>"
+
+    @property
+    def codes(self) -> set[str]:
+        """The codes of all warnings, about the shot and about its frames, see :data:`oiio_msspl.findings.CODES`."""
+        return {code for result in self.results.values() for code in result.codes}.union(codes_of(self.warnings))
 
     @property
     def exit_code(self) -> int:
@@ -119,7 +141,7 @@ class ShotReport:
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values."""
         results = [self.results[files.number] for files in self.shot.frames if files.number in self.results]
-        entries = [*self.others, *map(asdict, results)]
+        entries = [*self.others, *({**asdict(result), "warning_codes": result.codes} for result in results)]
         count = len(self.shot.frames) + len(self.others)
         counts = Counter(entry.get("status") for entry in entries)
         finished = len(self.results) == len(self.shot.frames)
@@ -132,6 +154,8 @@ class ShotReport:
             "counts": {"all": count, **{status: counts[status] for status in STATUSES}},
             "seconds": {k: round(v, 3) for k, v in {"wall": self.seconds, **self.stage_seconds}.items()},
             "temporal": self.temporal,
+            "warnings": self.warnings,
+            "warning_codes": codes_of(self.warnings),
             "frames_counted": None if self.frames_counted is None else round(self.frames_counted, 2),
             "first_fused": self.first,
             "frames": entries,
@@ -167,12 +191,15 @@ def fused_result(frame: FrameFiles, frame_report: dict[str, Any], report: ShotRe
     first = report.first = report.first or here
     warnings, repaired = list(frame_report["warnings"]), frame_report["repaired"]
     if repaired:
-        warnings.append(f"repaired values that were NaN or infinite in {', '.join(repaired)}")
+        warnings.append(Finding("repaired", f"repaired values that were NaN or infinite in {', '.join(repaired)}"))
     counted = frame_report["frames_counted"]
     if counted is not None and counted < ALONE:
-        warnings.append("its neighbours hardly count: their light or their surfaces differ from those of this frame")
-    warnings += [f"{text} in frame {first['frame']}: it may flicker" for text in _differences(here, first)]
-    more = {name: frame_report[name] for name in ("repaired", "seconds", "frames_counted")}
+        text = "its neighbours hardly count: their light or their surfaces differ from those of this frame"
+        warnings.append(Finding("neighbours_differ", text))
+    warnings += [
+        Finding("flicker", f"{text} in frame {first['frame']}: it may flicker") for text in _differences(here, first)
+    ]
+    more = {name: frame_report[name] for name in _OF_FRAME}
     return result_of(frame, FUSED, warnings=warnings, **more)
 
 
@@ -250,8 +277,8 @@ def read_earlier(
         overwrite, skip_existing: whether the file may exist.
 
     Returns:
-        ``warnings``, ``repaired`` and ``seconds`` of the frames in the earlier report, without the warning of
-        :func:`older_than`, which each run finds out anew.
+        What the earlier report says of each frame, without the warning of :func:`older_than`, which each run finds out
+        anew.
 
     Raises:
         InputError: the file exists and may not be replaced, or it is not a report of this shot. Not even with
@@ -269,9 +296,7 @@ def read_earlier(
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         entries = {
-            entry["frame"]: {name: entry[name] for name in ("repaired", "seconds")}
-            | {"frames_counted": entry.get("frames_counted")}
-            | {"warnings": [text for text in entry["warnings"] if not _OLDER.fullmatch(text)]}
+            entry["frame"]: {name: entry[name] for name in _OF_FRAME} | {"warnings": _kept_warnings(entry)}
             for entry in data["frames"]
         }
         output = data.get("output")
@@ -290,6 +315,12 @@ def read_earlier(
     return entries
 
 
-def older_than(path: Path) -> str:
+def _kept_warnings(entry: dict[str, Any]) -> list[Finding]:
+    """Return the warnings of a frame's entry in an earlier report, without that of :func:`older_than`."""
+    coded = zip(entry["warning_codes"], entry["warnings"], strict=True)
+    return [Finding(code, text) for code, text in coded if code != OLDER]
+
+
+def older_than(path: Path) -> Finding:
     """Return the warning that a result is older than a file that it is made from."""
-    return f"is older than {path}; --update fuses such frames again"
+    return Finding(OLDER, f"is older than {path}; --update fuses such frames again")

@@ -16,6 +16,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import HALF_MAX
@@ -106,7 +107,8 @@ def _store(replaced: ReplacedChannels, hr: MappedRender, fused: FusedFrame) -> N
     """
     channels = [each for each in hr.beauty_channels if hr.file.parts[each.part].data_window == hr.data_window]
     if len(channels) < len(hr.beauty_channels):
-        fused.warnings.append("the alpha has another data window than the beauty, so it is passed on as it is")
+        text = "the alpha has another data window than the beauty, so it is passed on as it is"
+        fused.warnings.append(Finding("no_alpha", text))
     height, width = fused.rgb.shape[:2]
     replaced.add(channels, width, height)
     clipped = 0
@@ -116,4 +118,5 @@ def _store(replaced: ReplacedChannels, hr: MappedRender, fused: FusedFrame) -> N
             values = fused.rgb[rows, :, i] if i < 3 or fused.alpha is None else fused.alpha[rows, :, 0]
             clipped += replaced.put(channel, start, values)
     if clipped:
-        fused.warnings.append(f"{clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}")
+        text = f"{clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}"
+        fused.warnings.append(Finding("clipped", text))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,6 +25,7 @@ from oiio_msspl.exr.write_options import (
     WriteOptions,
 )
 from oiio_msspl.exr.writer import write_fused
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY
 from oiio_msspl.image.arrays import HALF_MAX
@@ -31,6 +33,8 @@ from oiio_msspl.image.parallel import in_background
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import ShotFrame, State
 from oiio_msspl.jobs.report import FrameReport, provenance
+
+log = logging.getLogger(__name__)
 
 
 def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bool = False) -> None:
@@ -61,6 +65,7 @@ def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bo
     )
     frame.state, frame.picture = State.WRITTEN, None
     frame.report.seconds["write"] = time.perf_counter() - start
+    log.debug("report: %s", frame.report.as_dict())
 
 
 def write_frame(
@@ -123,9 +128,8 @@ def _write_exr(
     if stored_type(report.hr.beauty_channels, options) == "half":
         report.clipped = fused.clipped + int(np.count_nonzero(fused.rgb > HALF_MAX))
     if report.clipped:
-        report.warnings.append(
-            f"{report.clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}; --float keeps them"
-        )
+        text = f"{report.clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}; --float keeps them"
+        report.warnings.append(Finding("clipped", text))
     report.warnings += write_fused(
         report.output,
         report.hr.file,
@@ -166,5 +170,5 @@ def _write_preview(report: FrameReport, fused: FusedFrame, view: str | None, *, 
     try:
         write_preview(report.preview, fused.rgb, *windows, view, report.hr.space, overwrite=overwrite)
     except MssplError as error:
-        report.warnings.append(f"no preview: {error}")
+        report.warnings.append(Finding("no_preview", f"no preview: {error}"))
         report.preview = None

@@ -84,7 +84,7 @@ class Session:
         if device != "cpu" and (on_cpu := self.convolutions.get(CPU)):
             message = (
                 f"{file}: {on_cpu} of {sum(self.convolutions.values())} convolutions stay on the CPU; "
-                "use --device cpu, or a --model with a file for GPUs"
+                "use --device cpu, or name a file for GPUs with --model"
             )
             if device in COMPLETE:
                 raise InputError(f"--device {device}: {message}")

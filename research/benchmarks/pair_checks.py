@@ -8,7 +8,7 @@ Thresholds were chosen by the scenes in FRAMES. Those in FRESH are only measured
 and `research.benchmarks.render.generated_frames` render them. Each folder is a view, with ``hr_<n>spp.exr`` and
 ``lr_x<s>_<n>spp.exr``. All of its pairs are right, whole and cut to each quarter. Wrong pairs are made from the pairs
 of equal samples: the LRHS is framed, shifted, recoloured or made from the HRLS, or the HRLS gets layers of another
-scene. Frames of an odd size are measured as right pairs only, and whole. The LRHS's own albedo and normal are not used.
+scene. Frames of an odd size are measured as right pairs only, and whole. The LRHS's own albedo is not used.
 """
 
 from __future__ import annotations
@@ -98,9 +98,10 @@ class Pair:
 
     def warnings(self) -> list[str]:
         """Return what the checks say, or why they refuse the pair."""
-        lrhs, hrls = np.ascontiguousarray(self.lrhs[RGB]), {k: np.ascontiguousarray(v) for k, v in self.hrls.items()}
+        lrhs, hrls = ({k: np.ascontiguousarray(v) for k, v in side.items()} for side in (self.lrhs, self.hrls))
+        lrhs.pop(ALBEDO, None)
         try:
-            return check_renders(Render.from_arrays("lr", rgb=lrhs), Render.from_arrays("hr", **hrls)).warnings
+            return [*check_renders(Render.from_arrays("lr", **lrhs), Render.from_arrays("hr", **hrls)).warnings]
         except InputError as error:
             return [str(error)]
 

@@ -11,13 +11,16 @@ from tests.shots import layers, make_shot
 def test_a_pair_that_fits_and_one_that_does_not(files):
     done = run("msspl", "check", files / "lr.exr", files / "hr.exr")
     assert (done.returncode, done.stderr) == (0, "")
-    fits, not_judged = done.stdout.splitlines()
+    fits, not_judged, *advice = done.stdout.splitlines()
     assert fits.endswith("hr.exr: fits")
     assert not_judged == "  not judged: the albedo, the framing"  # the pair is small
+    assert advice and all(line.startswith("  advice: ") for line in advice)
     done = run("msspl", "check", files / "hr.exr", files / "lr.exr")
     assert done.returncode == 2
     assert "can't be fused: the inputs look swapped" in done.stdout
-    assert json.loads(run("msspl", "check", files / "lr.exr", files / "hr.exr", "--json").stdout)["fits"]
+    data = json.loads(run("msspl", "check", files / "lr.exr", files / "hr.exr", "--json").stdout)
+    assert data["fits"] and [f"  advice: {entry['text']}" for entry in data["advice"]] == advice
+    assert {entry["code"] for entry in data["advice"]} == {"no_lrhs"}
 
 
 def test_a_shot_is_checked_frame_by_frame(tmp_path):
@@ -27,14 +30,16 @@ def test_a_shot_is_checked_frame_by_frame(tmp_path):
     (tmp_path / "lr/lr.1003.exr").unlink()
     done = run("msspl", "check", tmp_path / "lr", tmp_path / "hr")
     assert done.returncode == 2
-    lines = [line for line in done.stdout.splitlines() if "not judged: " not in line]
+    lines = [line for line in done.stdout.splitlines() if not line.startswith(("  not judged: ", "  advice: "))]
     assert lines[0] == "frame 1001: fits"
     assert lines[1] == "frame 1002: does not fit"
     assert "times as bright" in lines[2]
-    assert lines[-1].startswith("frame 1003: can't be fused: ") and "no such file" in lines[-1]
+    assert lines[-2].startswith("frame 1003: can't be fused: ") and "no such file" in lines[-2]
+    assert lines[-1].startswith("the shot: frame by frame: ")
     assert run("msspl", "check", tmp_path / "lr", tmp_path / "hr", "--frames", "1001").returncode == 0
     data = json.loads(run("msspl", "check", tmp_path / "lr", tmp_path / "hr", "--json").stdout)
-    assert [(pair["frame"], pair["fits"]) for pair in data] == [(1001, True), (1002, False), (1003, False)]
+    assert data["warning_codes"] == ["not_averaged"]
+    assert [(pair["frame"], pair["fits"]) for pair in data["frames"]] == [(1001, True), (1002, False), (1003, False)]
 
 
 def test_a_wrong_pair_is_said_before_a_farm_is_asked(tmp_path):

@@ -111,6 +111,9 @@ def test_what_a_person_reads(tmp_path, bilinear_models):
     assert "  fused   2  1001,1004\n  failed  2  1002-1003 " in done.stdout
     assert done.stderr.count("error: frame 100") == 1  # one sentence, but for the number
     assert "frame 1004: fused (read " in done.stderr
+    assert "debug: report: " not in done.stderr
+    more = fuse(*given, "-v", "--temporal", "off", "--overwrite")  # -vv
+    assert more.stderr.count("debug: report: ") == 2
 
 
 def test_a_full_disk_and_a_link_to_nowhere_leave_nothing_half_written(tmp_path, bilinear_models):

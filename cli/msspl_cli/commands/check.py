@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -14,6 +13,7 @@ from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
     from oiio_msspl.jobs.pair_check import PairCheck
+    from oiio_msspl.jobs.shot_check import ShotCheck
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -42,38 +42,42 @@ def check(
 
     A pair does not fit if it can't be fused, or if the two renders do not seem to
     show the same frame: another camera, light, colour space, albedo or normal.
+    Advice says what more would help, and what it costs.
     """
     from oiio_msspl.jobs.pair_check import check_files
-    from oiio_msspl.jobs.sequence import find_shot, is_sequence
+    from oiio_msspl.jobs.sequence import is_sequence
+    from oiio_msspl.jobs.shot_check import check_shot
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None, colorspace)
-    pairs: list[tuple[int | None, PairCheck]] = []
     lr, hr = options.low_and_high(renders)
+    result: PairCheck | ShotCheck
     if any(is_sequence(path) for path in renders):
-        shot = find_shot(lr, hr, Path(), frames)
-        for frame in shot.frames:
-            high = frame.hr or shot.hr.pattern.path(frame.number)
-            low = None if lr is None else frame.lr or shot.lr.pattern.path(frame.number)
-            pairs.append((frame.number, check_files(low, high, inputs)))
-            _print(*pairs[-1], as_json)
+
+        def show(number: int, pair: PairCheck) -> None:
+            if not as_json:
+                _print(f"frame {number}", pair)
+
+        result = check_shot(lr, hr, frames, inputs, progress=show)
+        if not as_json:
+            for text in (*result.warnings, *([] if result.warnings else [result.temporal])):
+                console.say(f"the shot: {text}")
     elif frames:
         raise InputError("--frames is for shots: give folders, or patterns such as lr.####.exr")
     else:
-        pairs.append((None, check_files(lr, hr, inputs)))
-        _print(*pairs[0], as_json)
+        result = check_files(lr, hr, inputs)
+        if not as_json:
+            _print(f"{hr}" if lr is None else f"{lr} and {hr}", result)
     if as_json:
-        data = [pair.as_dict() if number is None else {"frame": number} | pair.as_dict() for number, pair in pairs]
-        print(json.dumps(data[0] if pairs[0][0] is None else data, indent=2))
-    if not all(pair.fits for _, pair in pairs):
+        print(json.dumps(result.as_dict(), indent=2))
+    else:
+        for text in result.advice:
+            console.say(f"  advice: {text}")
+    if not result.fits:
         raise typer.Exit(2)
 
 
-def _print(number: int | None, pair: PairCheck, as_json: bool) -> None:
-    """Print the outcome of a pair, unless JSON is printed in the end."""
-    if as_json:
-        return
-    files = f"{pair.hr}" if pair.lr is None else f"{pair.lr} and {pair.hr}"
-    name = files if number is None else f"frame {number}"
+def _print(name: str, pair: PairCheck) -> None:
+    """Print the outcome of a pair."""
     if pair.problem is not None:
         console.say(f"{name}: can't be fused: {pair.problem}")
     else:

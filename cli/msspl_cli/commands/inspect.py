@@ -36,6 +36,7 @@ def inspect(
 
     If the next frame lies beside a file, the two verify its motion vectors. The
     two renders of a frame tell whether a pixel filter has spread their noise.
+    Advice says what more would help, and what it costs.
 
     If a file can't be used, the reason is printed and the exit code is 2.
     """
@@ -62,6 +63,8 @@ def inspect(
                 console.aov_table(inspection.aovs(), inspection.render.notes)
                 if inspection.unused:
                     console.say(f"  neither read nor fused: {', '.join(inspection.unused)}")
+            for text in inspection.advice:
+                console.say(f"  advice: {text}")
             for problem in inspection.problems:
                 console.say(f"  can't be used: {problem}")
     if any(inspection.problems for inspection in inspections):

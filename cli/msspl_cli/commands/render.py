@@ -285,12 +285,14 @@ class _Printer:
 
     def _add_written(self) -> None:
         """Keep the reports of frames that are written, and print their warnings."""
+        from oiio_msspl.findings import codes_of
         from oiio_msspl.jobs.blender_source import beside
 
         while self._waiting and not self._shot.waits(result := Path(self._waiting[0]["output"])):
             report = self._waiting.pop(0)
             report["temporal"] = self._shot.text
             report["warnings"] += [*self._warnings, *self._shot.warnings(result)]
+            report["warning_codes"] = codes_of(report["warnings"])
             for render, suffix in zip(report["renders"], self._shot.suffixes, strict=True):
                 render["file"] = str(beside(result, suffix)) if self._keep else None
             self._reports.append(report)

@@ -29,16 +29,19 @@ EXAMPLES = """[bold]Examples[/bold]
   deadline bundle submit job/
 """
 
+_COMMAND = "Run this on the workers: a path, or a launcher such as 'rez env oiio_msspl -- msspl-fuse'."
 #: The group of its own options in the help text.
 JOB = "Job"
 #: Parameters of msspl-fuse that :func:`oiio_msspl.jobs.farm.openjd.make_job` takes itself, that every task has, or
 #: that are about this command.
 _TAKEN = {
-    *("renders", "output", "frames", "model", "quality", "map_file", "device", "view", "skip_existing"),
-    *("debug", "help_all", "version"),
+    *("renders", "output", "frames", "model", "quality", "map_file", "device", "view", "preview", "max_memory"),
+    *("skip_existing", "update", "debug", "help_all", "version"),
 }
 #: Parameters of msspl-fuse that a job can't have: a task skips existing frames and reports to the farm.
 _LEFT_OUT = {"overwrite", "report_file", "progress", "as_json", "scheduler"}
+#: Options whose default differs from that of msspl-fuse: a farm has nobody to look at previews.
+_DEFAULTS = {"preview": False}
 
 
 def _with_options_of_fuse(command: Callable[..., None]) -> Callable[..., None]:
@@ -46,7 +49,7 @@ def _with_options_of_fuse(command: Callable[..., None]) -> Callable[..., None]:
     own, fuses = (inspect.signature(function, eval_str=True).parameters for function in (command, fuse.fuse))
     shared = [parameter for name, parameter in fuses.items() if name not in _LEFT_OUT]
     parameters = [
-        parameter.replace(kind=parameter.KEYWORD_ONLY)
+        parameter.replace(kind=parameter.KEYWORD_ONLY, default=_DEFAULTS.get(parameter.name, parameter.default))
         for parameter in [*shared, *own.values()]
         if parameter.kind != parameter.VAR_KEYWORD
     ]
@@ -69,13 +72,25 @@ def submit(
         int,
         option(JOB, "Limit the time of a frame. A task gets N times as long.", metavar="SECONDS", min=1, max=1_000_000),
     ] = 1800,
+    name: Annotated[
+        str | None,
+        option(JOB, "Name the job. \\[default: folders and name of the renders, and the frames]", metavar="TEXT"),
+    ] = None,
+    command: Annotated[str, option(JOB, _COMMAND, metavar="COMMAND")] = "msspl-fuse",
+    conda: Annotated[
+        str | None, option(JOB, "Ask the queue for these Conda packages (CondaPackages).", metavar="PACKAGES")
+    ] = None,
+    rez: Annotated[
+        str | None, option(JOB, "Ask the queue for these Rez packages (RezPackages).", metavar="PACKAGES")
+    ] = None,
     **given: Any,
 ) -> None:
     """Write a shot as a job for a farm: an Open Job Description bundle.
 
     openjd and Deadline Cloud run it. Each task runs [bold]msspl-fuse[/bold] on N
     frames with the same options. A task that runs again fuses only the frames
-    that do not exist.
+    that do not exist, or are older than their renders. A worker needs the memory
+    of --max-memory, and a GPU if --device is one.
     """
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl.image.parallel import limit_threads
@@ -94,13 +109,17 @@ def submit(
     temporal = TemporalOptions(given["temporal"], given["motion_format"])
     max_memory = bytes_of(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
-    settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view")}
+    settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view", "max_memory")}
     settings |= {
         "inputs": inputs,
         "model": model,
         "options": _passed_on(context, given),
         "chunk": chunk,
         "timeout": timeout,
+        "previews": given["preview"],
+        "name": name,
+        "command": command,
+        "packages": {key: wanted for key, wanted in (("conda", conda), ("rez", rez)) if wanted},
     }
     job = make_job(*options.low_and_high(given["renders"]), given["output"], **settings)
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
@@ -115,8 +134,7 @@ def submit(
         console.say(text, error=True)
     if given["quiet"]:
         return
-    skips = "are skipped unless an input is newer" if given["update"] else "will be skipped"
-    skipped = f"; {job.existing} exist and {skips}" if job.existing else ""
+    skipped = f"; {job.existing} exist and are skipped unless an input is newer" if job.existing else ""
     console.say(f"{len(job.shot.frames)} frames{skipped}. To run the job:")
     values = f"file://{bundle / OPENJD_VALUES}"
     console.say(f"  openjd run {shlex.quote(str(bundle / TEMPLATE))} --job-param {shlex.quote(values)}")

@@ -58,6 +58,7 @@ class HrlsAverages:
         self.albedo: Array | None = None
         self.normal_edges: Array | None = None
         self.normal_noise: Array | None = None
+        self._cosines = np.zeros(2)  # sums of products of the normals, and of their lengths
         self._parts = 1 if alignment.scale == ONE_SIZE else 2
         self.quarters = np.zeros((self._parts * self._middle.height, self._parts * self._middle.width), np.float32)
         self.failed = tuple(np.zeros(self.rgb.shape, np.bool_) for _ in range(2))
@@ -95,7 +96,18 @@ class HrlsAverages:
                 self.normal_edges, self.normal_noise = np.zeros(size, np.float32), np.zeros(size, np.float32)
             pixels = _hrls_pixels(pair, NORMAL, window)
             self.normal_noise[target] = _noise_of_edges(pixels, pair.scale)
-            self.normal_edges[target] = _edge_lengths(box_downsample(pixels, pair.scale))
+            mean = box_downsample(pixels, pair.scale)
+            self.normal_edges[target] = _edge_lengths(mean)
+            if NORMAL in pair.lrhs and pair.lrhs is not pair.hrls:
+                low = pair.lrhs[NORMAL][window.slices(pair.lrhs_area)]
+                lengths = np.linalg.norm(low, axis=-1) * np.linalg.norm(mean, axis=-1)
+                self._cosines += np.sum(low * mean), np.sum(lengths)
+
+    @property
+    def normals_agree(self) -> float | None:
+        """The mean cosine between the normals of both renders over the central area; None if one of them has none."""
+        product, lengths = self._cosines
+        return float(product / lengths) if lengths > 0 else None
 
     def _add_beauty(self, low: Array, high: Array, place: Window) -> None:
         """Fill ``rgb`` and sum ``blocks``, given the colours (h, w, 3) and (s*h, s*w, 3) of a ``place`` in the grid."""

@@ -9,6 +9,7 @@ from typing import TypeVar
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.shot import ShotMotion
 from oiio_msspl.fusion.motion.source import MotionFrame
@@ -27,7 +28,7 @@ def find_hops(
     number: int,
     neighbours: Sequence[int],
     frame_of: Callable[[int], tuple[MotionFrame, F]],
-    warnings: list[str],
+    warnings: list[Finding],
 ) -> list[Hop[F]]:
     """Find the hops from a frame to its neighbours on one side, up to the first that can't be averaged.
 
@@ -49,17 +50,19 @@ def find_hops(
             lacking: list[str] = []
             if isinstance(picture, RenderPair) and isinstance(neighbour_picture, RenderPair):
                 if nearer is own and shared_noise(picture, neighbour_picture) > SAME_NOISE:
-                    warnings.append(f"frames {min(number, other)} and {max(number, other)} {SAME_SEED}")
+                    text = f"frames {min(number, other)} and {max(number, other)} {SAME_SEED}"
+                    warnings.append(Finding("same_seed", text))
                 lacking = lacking_passes(picture, neighbour_picture)
             there, back = motion.between(nearer, neighbour)
         except InputError as error:
-            warnings.append(f"frame {other} is not averaged: {error}")
+            warnings.append(Finding("missing_neighbour", f"frame {other} is not averaged: {error}"))
             break
         hops.append(Hop(neighbour_picture, there, back))
         nearer = neighbour
         if lacking:
             names = " and ".join(lacking)
-            warnings.append(f"frame {other} has no set of passes with {names}, so passes are not averaged")
+            text = f"frame {other} has no set of passes with {names}, so passes are not averaged"
+            warnings.append(Finding("passes", text))
     return hops
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.passes.bands import Band, PassInputs, PassSources, band_windows, estimated_of, in_both
 from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, doubts_of, make_exact
 from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, lrhs_names
@@ -48,7 +49,7 @@ class FusedPasses:
     """By name of a fused set: the layers that were read from the HRLS alone, see :attr:`PassJob.hrls_alone`."""
     lacking: dict[str, float] = field(default_factory=dict)
     """By name of a fused set: the share of the beauty's light that is in no layer, for those that lack some."""
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Finding] = field(default_factory=list)
     """A sentence for each set of which the LRHS has some layers only, or layers that do not sum to its beauty, or of
     which values were too bright for half."""
 
@@ -107,13 +108,16 @@ def fuse_passes(
                 tell(1)
             repaired.update(band.repaired)
     fused.warnings += [
-        f"{name}: {count} values are too bright for half and were clipped to {HALF_MAX:.0f}, so the layers do not sum "
-        "to the beauty there; render them as float"
+        Finding(
+            "clipped",
+            f"{name}: {count} values are too bright for half and were clipped to {HALF_MAX:.0f}, so the layers do not "
+            "sum to the beauty there; render them as float",
+        )
         for name, count in clipped.items()
         if count
     ]
     fused.warnings += [
-        f"{name}: {count} values of the HRLS are NaN or infinite; they were repaired"
+        Finding("repaired", f"{name}: {count} values of the HRLS are NaN or infinite; they were repaired")
         for name, count in repaired.items()
     ]
     return fused

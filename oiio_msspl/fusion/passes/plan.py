@@ -9,6 +9,7 @@ from functools import partial
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.exr.reader import Channel
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.passes.layers import LayerLight, same_layers
 from oiio_msspl.fusion.passes.sums import check_light, is_sum_of
 from oiio_msspl.image.parallel import in_parallel
@@ -65,7 +66,7 @@ class PassPlan:
     """Sets with more layers come first, because layers of the others may be sums of theirs."""
     refused: dict[str, str] = field(default_factory=dict)
     """Why other sets are not fused, by name."""
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Finding] = field(default_factory=list)
     """A sentence for each set whose layers the LRHS lacks, or that do not sum to its beauty."""
 
 
@@ -94,11 +95,11 @@ def plan_passes(low: LayerLight, high: LayerLight, sets: Sequence[AdditiveSet]) 
         job = PassJob(layers, names, lrhs, check.residual if check.remainder else 0.0, derived, check.noise_free)
         plan.jobs.append(job)
         if problem:
-            plan.warnings.append(
-                f"{layers.name}: the LRHS's layers do not sum to its beauty, so they are not read: {problem}"
-            )
+            text = f"{layers.name}: the LRHS's layers do not sum to its beauty, so they are not read: {problem}"
+            plan.warnings.append(Finding("passes", text))
         elif lrhs and job.hrls_alone:
-            plan.warnings.append(f"{layers.name}: the LRHS lacks {job.hrls_alone}, so more noise is left there")
+            text = f"{layers.name}: the LRHS lacks {job.hrls_alone}, so more noise is left there"
+            plan.warnings.append(Finding("passes", text))
     taken = {channel for job in plan.jobs for channel in job.channels}
     for job in plan.jobs:
         for layer in job.layers.coarser:

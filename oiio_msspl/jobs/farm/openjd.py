@@ -2,14 +2,16 @@
 """Describes a shot as an Open Job Description job: a bundle of the job's template and the values of its parameters.
 
 Each task runs ``msspl-fuse`` on a chunk of the frames. Its arguments are a list that no shell reads, so names may
-contain spaces and quotes. Paths are job parameters, which a farm can map to its own folders or copy.
+contain spaces and quotes. Paths are job parameters, which a farm can map to its own folders or copy. A task that runs
+again keeps the frames that are newer than their inputs, and fuses the others.
 """
 
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,15 +19,24 @@ from typing import Any
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_encodable, check_folder, replacing
 from oiio_msspl.exr.preview import check_view
+from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.jobs.checks import check_no_file, check_no_input, model_of_shot
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
+from oiio_msspl.jobs.settings import bytes_of
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import ONE_SIZE, SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS
 
 #: Seconds between SIGTERM and SIGKILL, in which msspl-fuse finishes the frame that it is writing.
 GRACE = 120
+
+#: Devices that a farm counts as GPUs.
+GPUS = ("cuda", "tensorrt", "directml")
+#: Names of the job parameters by which the environments of a farm's queue install packages, by option.
+PACKAGES = {"conda": "CondaPackages", "rez": "RezPackages"}
+#: The most characters that the name of a job may have.
+_LONGEST_NAME = 128
 
 #: The most characters that a job parameter may have (Open Job Description 2023-09).
 _LONGEST = 1024
@@ -58,7 +69,7 @@ class Job:
 
     @property
     def existing(self) -> int:
-        """Number of frames that have a result already. Their tasks skip them."""
+        """Number of frames that have a result already. Their tasks skip them, unless an input is newer."""
         return sum(frame.output.exists() for frame in self.shot.frames)
 
 
@@ -73,9 +84,14 @@ def make_job(
     map_file: Path | None = None,
     device: str = "cpu",
     view: str | None = None,
+    previews: bool = False,
+    max_memory: int | str = MAX_MEMORY,
     options: Sequence[str] = (),
     chunk: int = 10,
     timeout: int = 1800,
+    name: str | None = None,
+    command: str = "msspl-fuse",
+    packages: Mapping[str, str] = {},
 ) -> Job:
     """Describe a shot as a job. A mistake that would fail every task is found here.
 
@@ -86,11 +102,17 @@ def make_job(
         model: as in :func:`oiio_msspl.fuse_files`. None and ``auto`` are a family that suits the noise of the first
             pair. The job names it, because all frames of a shot need the same model.
         map_file: TOML file with the user's mapping.
-        device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`. It need not be usable on this machine.
+        device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`. It need not be usable on this machine. A worker
+            needs a GPU for one of ``GPUS``.
         view: None, or the OpenColorIO view of the previews.
+        previews: write a PNG beside each EXR.
+        max_memory: bytes that a task should stay below, also as ``4G``. A worker needs as much.
         options: more arguments of ``msspl-fuse``, for all frames. They are not checked.
         chunk: frames per task.
         timeout: seconds per frame.
+        name: the job's name; None for the last folders and the name of the renders, and the frames.
+        command: the program on the workers, or a launcher with its arguments: ``rez env oiio_msspl -- msspl-fuse``.
+        packages: ``conda`` or ``rez`` and the packages that the environment of a farm's queue installs.
 
     Returns:
         The shot and its job.
@@ -107,15 +129,20 @@ def make_job(
         raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
     if view is not None:
         check_view(view)
-    options = [*(["--device", device] if device != "cpu" else []), *(["--ocio-view", view] if view else []), *options]
+    memory = bytes_of(max_memory)
+    common = ["--device", device] if device != "cpu" else []
+    common += ["--ocio-view", view] if view else []
+    common += [] if previews else ["--no-preview"]
+    common += [] if memory == MAX_MEMORY else ["--max-memory", str(max_memory)]
+    options = [*common, *options]
     files = {"--map-file": map_file} if map_file else {}
     shot = find_shot(lr, hr, output, frames)
     # The job names its model: a worker with another version, which would choose another family, then refuses the frame.
-    name = model_of_shot(shot, inputs, model)
-    if shipped_models().keys() & {name, *(f"{name}-x{scale}" for scale in (ONE_SIZE, *SCALES))}:
-        options += ["--model", name]
+    family = model_of_shot(shot, inputs, model)
+    if shipped_models().keys() & {family, *(f"{family}-x{scale}" for scale in (ONE_SIZE, *SCALES))}:
+        options += ["--model", family]
     else:
-        files["--model"] = find_model(SCALES[0], name)
+        files["--model"] = find_model(SCALES[0], family)
         Contract.of_file(files["--model"])
 
     if not any(frame.lr and frame.hr for frame in shot.frames):
@@ -125,7 +152,49 @@ def make_job(
     folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
     if not folder.is_dir():
         raise InputError(f"{output}: the folder {folder} does not exist; create it first")
-    return _describe(shot, renders, output, options, files, chunk, timeout)
+    job = _describe(shot, renders, output, options, files, chunk, timeout)
+    job.template["name"] = _literal(name or _name_of(shot))[:_LONGEST_NAME]
+    _run_by(job, command, packages)
+    job.template["steps"][0]["hostRequirements"] = _requirements(device, memory)
+    return job
+
+
+def _name_of(shot: Shot) -> str:
+    """Name a job after its renders and frames: the last folders say the shot, and file names alone rarely do."""
+    pattern = shot.hr.pattern
+    folders = [part for part in pattern.folder.absolute().parts[1:][-3:] if "{{" not in part]
+    base = pattern.base.rstrip("._-")
+    frames = format_frames(sorted(frame.number for frame in shot.frames))
+    return f"msspl-fuse {'/'.join([*folders, base] if '{{' not in base else folders)} {frames}"
+
+
+def _run_by(job: Job, command: str, packages: Mapping[str, str]) -> None:
+    """Let a job run its program by a launcher, and in an environment with packages."""
+    try:
+        words = [_literal(word) for word in shlex.split(command)]
+    except ValueError as error:
+        raise InputError(f"--command {command!r}: can't be read ({error}); quote it as for a shell") from error
+    if not words:
+        raise InputError("--command: is empty; name msspl-fuse, or what starts it")
+    action = job.template["steps"][0]["script"]["actions"]["onRun"]
+    action["command"], action["args"] = words[0], [*words[1:], *action["args"]]
+    for manager, wanted in packages.items():
+        if manager not in PACKAGES:
+            raise InputError(f"packages of {manager!r}: use one of {', '.join(PACKAGES)}")
+        control = {"control": "LINE_EDIT", "label": f"{manager.title()} packages", "groupLabel": "Software"}
+        description = "Packages that the environment of the queue installs"
+        job.template["parameterDefinitions"].append(
+            {"name": PACKAGES[manager], "description": description, "type": "STRING", "userInterface": control}
+        )
+        job.values[PACKAGES[manager]] = wanted
+
+
+def _requirements(device: str, memory: int) -> dict[str, Any]:
+    """Return what a worker must have: as much memory as a task may take, and a GPU if the device is one."""
+    amounts = [{"name": "amount.worker.memory", "min": -(-memory // 2**20)}]  # MiB
+    if device in GPUS:
+        amounts.append({"name": "amount.worker.gpu", "min": 1})
+    return {"amounts": amounts}
 
 
 def _describe(
@@ -141,21 +210,24 @@ def _describe(
     parameters: list[dict[str, Any]] = []
     values: dict[str, Any] = {}
 
-    def add(name: str, value: str | int, description: str, **definition: Any) -> str:
-        """Define a job parameter and return the text that stands for its value."""
+    def add(name: str, value: str | int, description: str, control: str, label: str, **definition: Any) -> str:
+        """Define a job parameter with its widget and label, and return the text that stands for its value."""
         if len(str(value)) > _LONGEST:
             raise InputError(f"{name} has more than the {_LONGEST} characters that a job parameter may have: {value}")
-        parameters.append({"name": name, "description": description, **definition})
+        widget = {"control": control, "label": label, "groupLabel": "Software" if name == "Model" else "Shot"}
+        parameters.append({"name": name, "description": description, **definition, "userInterface": widget})
         values[name] = value
         return f"{{{{Param.{name}}}}}"
 
     def add_sequence(name: str, path: Path, is_folder: bool, what: str, flow: str) -> str:
         """Define two parameters, folder and pattern: a farm can copy a folder, but not a pattern."""
         folder = str((path if is_folder else path.parent).absolute())
-        directory = add(f"{name}Folder", folder, what, type="PATH", objectType="DIRECTORY", dataFlow=flow)
-        pattern = add(
-            f"{name}Name", "" if is_folder else path.name, "Pattern in the folder; empty for all of it", type="STRING"
-        )
+        label = f"{what}: "
+        choose = {"type": "PATH", "objectType": "DIRECTORY", "dataFlow": flow}
+        directory = add(f"{name}Folder", folder, what, "CHOOSE_DIRECTORY", f"{label}folder", **choose)
+        said = "Pattern in the folder; empty for all of it"
+        name_in_folder = "" if is_folder else path.name
+        pattern = add(f"{name}Name", name_in_folder, said, "LINE_EDIT", f"{label}files", type="STRING")
         return f"{directory}/{pattern}"
 
     arguments = [
@@ -168,14 +240,17 @@ def _describe(
     ]
     # Open Job Description writes ranges in rising order, and their step with a colon.
     numbers = format_frames(sorted(frame.number for frame in shot.frames)).replace("x", ":")
-    frame_range = add("Frames", numbers, "Frames of the shot: 1001-1100 or 1001-1099:2,1200", type="STRING")
+    said = "Frames of the shot: 1001-1100 or 1001-1099:2,1200"
+    frame_range = add("Frames", numbers, said, "LINE_EDIT", "Frames", type="STRING")
     # The time limit of a task is written for so many frames.
-    size = add("FramesPerTask", chunk, "Frames per task", type="INT", minValue=1, maxValue=chunk)
+    limits = {"type": "INT", "minValue": 1, "maxValue": chunk}
+    size = add("FramesPerTask", chunk, "Frames per task", "SPIN_BOX", "Frames per task", **limits)
     for option, path in files.items():
         name = option.removeprefix("--").title().replace("-", "")
-        file = add(name, str(path.absolute()), f"{option} of msspl-fuse", type="PATH", objectType="FILE", dataFlow="IN")
+        said, choose = f"{option} of msspl-fuse", {"type": "PATH", "objectType": "FILE", "dataFlow": "IN"}
+        file = add(name, str(path.absolute()), said, "CHOOSE_INPUT_FILE", option.removeprefix("--"), **choose)
         arguments += [option, file]
-    arguments += ["--frames", "{{Task.Param.Frame}}", "--skip-existing", "--progress", "openjd"]
+    arguments += ["--frames", "{{Task.Param.Frame}}", "--update", "--progress", "openjd"]
     arguments += map(_literal, options)
     task_frames = {
         "name": "Frame",
@@ -197,7 +272,7 @@ def _describe(
     template = {
         "specificationVersion": "jobtemplate-2023-09",
         "extensions": ["TASK_CHUNKING"],
-        "name": _literal(f"msspl-fuse {shot.hr.pattern.base}")[:128],
+        "name": "msspl-fuse",
         "parameterDefinitions": parameters,
         "steps": [step],
     }

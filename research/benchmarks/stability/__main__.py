@@ -51,7 +51,7 @@ def ours(session: Session) -> Method:
 
     def run(pair: Pair) -> tuple[Array, list[str]]:
         fused = fuse(pair.lr, pair.hr, session)
-        return fused.rgb, fused.warnings
+        return fused.rgb, [*fused.warnings]
 
     return run
 

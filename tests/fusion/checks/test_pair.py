@@ -239,6 +239,20 @@ def test_a_shifted_aov_is_noticed(scale, aov):
     assert f"the {aov} is shifted against the picture by 8.0 pixels to the right" in warning
 
 
+@pytest.mark.parametrize("turned", [1, -1])
+def test_negated_normals_are_noticed(scale, turned):
+    """By the normals of both renders. Where one of them has none, nobody can tell."""
+    _, _, normal = scene(scale)
+    low, high = pair(scale, normal=turned * normal)
+    layers = {"rgb": low.layers["rgb"], "normal": np.ascontiguousarray(downsample(normal, scale), np.float32)}
+    both = check_renders(Render.from_arrays("lr", **layers), high)
+    assert [text.code for text in both.warnings] == ([] if turned == 1 else ["negated_normal"])
+    unknown = "which way the normals point"
+    assert unknown not in both.not_judged
+    alone = check_renders(low, high)
+    assert alone.warnings == [] and unknown in alone.not_judged
+
+
 @pytest.mark.parametrize("gains", [(1.25, 1, 0.8), (0.8, 1, 1.1)])
 def test_another_white_balance_is_noticed(scale, gains):
     (warning,) = warnings(scale, lr=pair(scale)[0].layers["rgb"] * np.float32(gains))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from oiio_msspl.errors import MssplError
+from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.jobs.farm import openjd as bundles
 from tests.conftest import write_exr
 from tests.jobs.test_over_time import make_shot_with_passes
@@ -48,7 +48,7 @@ def test_the_bundle_is_a_valid_job_of_both_forms(tmp_path, bilinear_models):
     make_shot(tmp_path, 6)
     (tmp_path / "hr/beauty.1004.exr").unlink()
     elsewhere = ("--map", "albedo=a.exr", "--device", "cuda")  # which need not be usable here
-    more = ("--chunk", 3, "--timeout", 60, "--layers", "a b", "--half")
+    more = ("--chunk", 3, "--timeout", 60, "--layers", "a b", "--half", "--max-memory", "4G", "--conda", "oiio-msspl")
     done = submit(tmp_path, "--model", bilinear_models[4], *elsewhere, *more)
     assert done.returncode == 0, done.stderr
     assert "beauty.####.exr lacks 1004" in done.stderr and "6 frames" in done.stdout
@@ -66,6 +66,12 @@ def test_the_bundle_is_a_valid_job_of_both_forms(tmp_path, bilinear_models):
     assert action["timeout"] == 180
     assert action["cancelation"]["mode"] == "NOTIFY_THEN_TERMINATE"
     assert action["args"][-3:] == ["--layers", "a b", "--half"]
+    assert {"--no-preview", "--update"} <= {*action["args"]} and "--skip-existing" not in action["args"]
+    needs = {amount["name"]: amount["min"] for amount in data["steps"][0]["hostRequirements"]["amounts"]}
+    assert needs == {"amount.worker.memory": 4096, "amount.worker.gpu": 1}
+    assert data["name"] == f"msspl-fuse {'/'.join((*tmp_path.parts[-2:], 'hr/beauty'))} 1001-1006"
+    assert values["CondaPackages"] == "oiio-msspl"
+    assert all(p["userInterface"]["label"] for p in data["parameterDefinitions"])
     assert action["args"][action["args"].index("--map") + 1] == f"albedo={Path('a.exr').absolute()}"
     assert values["Model"] == str(bilinear_models[4])
     kinds = {p["name"]: (p.get("objectType"), p.get("dataFlow")) for p in data["parameterDefinitions"]}
@@ -124,7 +130,9 @@ def test_tasks_average_frames_with_neighbours_of_other_tasks(averaged, bilinear_
 def test_a_bad_frame_fails_its_task_and_the_next_try_does_only_that_one(tmp_path, bilinear_models):
     make_shot(tmp_path, 4)
     (tmp_path / "hr/beauty.1003.exr").write_text("no EXR")
-    assert submit(tmp_path, "--model", bilinear_models[4], "--chunk", 2).returncode == 0
+    # With neighbours, the others are fused again, too: they lacked this one.
+    options = ("--model", bilinear_models[4], "--chunk", 2, "--temporal", "off")
+    assert submit(tmp_path, *options).returncode == 0
     process = openjd(tmp_path)
     said = process.communicate()[0]
     assert process.returncode != 0
@@ -138,6 +146,77 @@ def test_a_bad_frame_fails_its_task_and_the_next_try_does_only_that_one(tmp_path
     assert process.returncode == 0, said
     assert re.findall(r"frame (\d+) fused", said) == ["1003"]
     assert len(re.findall(r"frame \d+ skipped", said)) == 3
+
+
+def test_a_resubmitted_job_fuses_what_was_rendered_again(tmp_path, bilinear_models):
+    """Before, the frames of the first job were kept, whatever had become of their renders."""
+    make_shot(tmp_path, 3)
+    assert submit(tmp_path, "--model", bilinear_models[4], "--temporal", "off").returncode == 0
+    assert openjd(tmp_path).communicate()[0] and (tmp_path / "out/beauty.1003.exr").exists()
+    before = contents(tmp_path / "out")
+    assert sorted(before) == [f"beauty.{number}.exr" for number in (1001, 1002, 1003)]  # and no preview
+    write_exr(tmp_path / "hr/beauty.1002.exr", layers(7) | {"Z": layers(7)["Z"] * 2})
+    later = time.time() + 2
+    os.utime(tmp_path / "hr/beauty.1002.exr", (later, later))
+    said = openjd(tmp_path).communicate()[0]
+    assert re.findall(r"frame (\d+) fused", said) == ["1002"], said
+    after = contents(tmp_path / "out")
+    assert [name for name in before if before[name] != after[name]] == ["beauty.1002.exr"]
+
+
+@pytest.mark.parametrize("chunk", [2, 5])
+def test_a_job_of_one_render_a_frame_gives_the_frames_of_one_run(tmp_path, chunk):
+    """With a model that ships, and with neighbours of other tasks."""
+    make_shot_with_passes(tmp_path, count=5)
+    options = ("--quality", "fast", "--no-preview")
+    bundle = ("--bundle", tmp_path / "job", "--chunk", chunk)
+    assert run("msspl", "submit", tmp_path / "hr", "-o", tmp_path / "out", *options, *bundle).returncode == 0
+    values = json.loads((tmp_path / "job/openjd_values.json").read_text())
+    assert "LRFolder" not in values
+    process = openjd(tmp_path)
+    said = process.communicate()[0]
+    assert process.returncode == 0, said
+    assert len(re.findall(r"Frame\(CHUNK\[INT\]\) = ", said)) == -(-5 // chunk)
+    local = fuse(tmp_path / "hr", "-o", tmp_path / "local", *options)
+    assert local.returncode == 0 and "frames before and after each" in local.stdout, local.stderr
+    assert pixels(tmp_path / "out") == pixels(tmp_path / "local")
+
+
+def test_a_launcher_runs_the_program(tmp_path, bilinear_models):
+    make_shot(tmp_path, 1)
+    launcher = f"env MSSPL_TEST=1 '{SCRIPTS}/msspl-fuse'"
+    options = ("--model", bilinear_models[4], "--command", launcher, "--name", "sh010 denoise", "--preview")
+    assert submit(tmp_path, *options).returncode == 0
+    template = json.loads((tmp_path / "job/template.json").read_text())
+    action = template["steps"][0]["script"]["actions"]["onRun"]
+    assert (template["name"], action["command"]) == ("sh010 denoise", "env")
+    assert action["args"][:2] == ["MSSPL_TEST=1", f"{SCRIPTS}/msspl-fuse"]
+    process = openjd(tmp_path)
+    assert process.communicate()[0] and process.returncode == 0
+    assert sorted(contents(tmp_path / "out")) == ["beauty.1001.exr", "beauty.1001.png"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"command": "a 'b"}, r"can't be read \(No closing quotation\)"),
+        ({"command": ""}, "is empty"),
+        ({"command": "{{x}}"}, "start of a parameter"),
+        ({"name": "{{x}}"}, "start of a parameter"),
+        ({"packages": {"pip": "x"}}, "use one of conda, rez"),
+        ({"max_memory": "much"}, "write it as 3G"),
+    ],
+)
+def test_what_a_job_cannot_say_is_refused(tmp_path, arguments, message):
+    make_shot(tmp_path, 1)
+    with pytest.raises(InputError, match=message):
+        bundles.make_job(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", **arguments)
+
+
+def test_a_worker_without_gpu_will_do_for_the_cpu(tmp_path):
+    make_shot(tmp_path, 1)
+    job = bundles.make_job(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert job.template["steps"][0]["hostRequirements"] == {"amounts": [{"name": "amount.worker.memory", "min": 3072}]}
 
 
 def test_a_canceled_job_ends_with_whole_frames(tmp_path, bilinear_models):

@@ -45,7 +45,7 @@ from oiio_msspl.jobs.read import features_read, read_frame
 from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, written_layers
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
-from oiio_msspl.jobs.timeline import Key
+from oiio_msspl.jobs.timeline import Key, neighbours
 from oiio_msspl.jobs.views import store_view
 from oiio_msspl.model.contract import ONE_SIZE
 
@@ -236,7 +236,10 @@ class ShotRun:
         before, after = self._hops_of_results(frame)
         warnings = list(dict.fromkeys([*frame.fused.warnings, *frame.warnings]))
         picture = average_results(frame.fused, before, after) if before or after else frame.fused
-        return replace(picture, warnings=warnings)
+        # Averages of averages count no frame twice.
+        most = 1 + len(neighbours(frame.number, self.plan.count, self.plan.frames))
+        frames = None if picture.frames is None else np.minimum(picture.frames, np.float32(most))
+        return replace(picture, warnings=warnings, frames=frames)
 
     def _fuse_passes(self, frame: ShotFrame, picture: FusedFrame) -> None:
         """Fuse the passes of a view and add them to its final picture."""

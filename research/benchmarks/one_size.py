@@ -3,14 +3,16 @@
 
     python -m research.benchmarks.one_size RENDERS --one 32 --two 16:32 --table research/benchmarks/results/one_size.csv
 
-RENDERS are those of :mod:`research.benchmarks.scenes`. "joint-x1" is our model on one render, "joint-x1, two seeds" on
-two of the same size, "joint-x2" on an LRHS of half the size and an HRLS with half of the samples each. "OIDN" and "OIDN
-prefiltered" get the one render, and "OIDN on two seeds" the mean of both, weighted by their spp.
+RENDERS are those of :mod:`research.benchmarks.scenes`. "best-x1" is the model that `--quality best` takes for the noise
+of one render, "best-x1, two seeds" that for two of the same size, "joint-large-x2" that for an LRHS of half the size
+and an HRLS with half of the samples each. "OIDN" and "OIDN prefiltered" get the one render, and "OIDN, two seeds" the
+mean of both, weighted by their spp.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,7 +20,9 @@ from pathlib import Path
 from oiio_msspl import Render, fuse
 from oiio_msspl.compare import scores
 from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array
+from oiio_msspl.jobs.settings import family_for_noise
 from oiio_msspl.model.catalogue import QUALITIES, load_model
 from oiio_msspl.model.contract import ONE_SIZE
 from oiio_msspl.model.session import Session
@@ -32,32 +36,45 @@ SEEDS = ", two seeds"
 #: Scale of the pair of two sizes.
 PAIR = 2
 
-Sessions = dict[int, list[Session]]
+#: A method, its model if it is one of ours, and a function that computes its picture.
+Method = tuple[str, str | None, Callable[[], Array]]
 
 
-def of_one(scene: scenes.Scene, sessions: Sessions, spp: int) -> Iterator[tuple[str, Callable[[], Array]]]:
-    """Yield every method that gets one render or a pair of two sizes, and a function that computes its picture."""
+def of_one(scene: scenes.Scene, spp: int) -> Iterator[Method]:
+    """Yield every method that gets one render or a pair of two sizes."""
     render = scene.hrls(spp)
-    yield "render", partial(scenes.beauty, render)
-    yield "OIDN", partial(oidn, render)
-    yield "OIDN prefiltered", partial(oidn_prefiltered, render)
-    for session in sessions[ONE_SIZE]:
-        yield session.name, partial(_fused, render, render, session)
-    for session in sessions[PAIR]:
-        yield session.name, partial(_fused, scene.lrhs(PAIR, spp // 2), scene.hrls(spp // 2), session)
+    yield "render", None, partial(scenes.beauty, render)
+    yield "OIDN", None, partial(oidn, render)
+    yield "OIDN prefiltered", None, partial(oidn_prefiltered, render)
+    yield from _of_one_size(render, render)
+    for quality in QUALITIES:
+        session = _loaded(PAIR, quality)
+        pair = scene.lrhs(PAIR, spp // 2), scene.hrls(spp // 2)
+        yield session.name, session.name, partial(_fused, *pair, session)
 
 
-def of_two(scene: scenes.Scene, sessions: Sessions, spp: tuple[int, int]) -> Iterator[tuple[str, Callable[[], Array]]]:
-    """Yield every method that gets two renders of one size, and a function that computes its picture."""
+def of_two(scene: scenes.Scene, spp: tuple[int, int]) -> Iterator[Method]:
+    """Yield every method that gets two renders of one size."""
     first, second = (scene.hrls(count) for count in spp)
     share = spp[0] / sum(spp)
     low, high = (render.read(render.data_window) for render in (first, second))
     mean = Render.from_arrays("mean", **{name: share * low[name] + (1 - share) * high[name] for name in high})
-    yield f"render{SEEDS}", partial(scenes.beauty, mean)
-    yield f"OIDN{SEEDS}", partial(oidn, mean)
-    yield f"OIDN prefiltered{SEEDS}", partial(oidn_prefiltered, mean)
-    for session in sessions[ONE_SIZE]:
-        yield f"{session.name}{SEEDS}", partial(_fused, first, second, session, share)
+    yield f"render{SEEDS}", None, partial(scenes.beauty, mean)
+    yield f"OIDN{SEEDS}", None, partial(oidn, mean)
+    yield f"OIDN prefiltered{SEEDS}", None, partial(oidn_prefiltered, mean)
+    for method, model, picture in _of_one_size(first, second, share):
+        yield f"{method}{SEEDS}", model, picture
+
+
+def _of_one_size(lr: ReadableRender, hr: ReadableRender, share: float | None = None) -> Iterator[Method]:
+    for quality, family in QUALITIES.items():
+        session = _loaded(ONE_SIZE, family_for_noise(family, lr, hr, align(lr, hr))[0])
+        yield f"{quality}-x1", session.name, partial(_fused, lr, hr, session, share)
+
+
+@functools.cache
+def _loaded(scale: int, name: str) -> Session:
+    return load_model(scale, name)
 
 
 def _fused(lr: ReadableRender, hr: ReadableRender, session: Session, share: float | None = None) -> Array:
@@ -66,14 +83,13 @@ def _fused(lr: ReadableRender, hr: ReadableRender, session: Session, share: floa
 
 def measure(folder: Path, one: Sequence[int], two: Sequence[tuple[int, int]]) -> list[Row]:
     """Return a row for each scene, average spp and method."""
-    sessions = {scale: [load_model(scale, quality) for quality in QUALITIES] for scale in (ONE_SIZE, PAIR)}
     rows: list[Row] = []
     for scene in scenes.load(folder):
-        jobs = [(spp, of_one(scene, sessions, spp)) for spp in one]
-        jobs += [(sum(spp), of_two(scene, sessions, spp)) for spp in two]
+        jobs = [(spp, of_one(scene, spp)) for spp in one]
+        jobs += [(sum(spp), of_two(scene, spp)) for spp in two]
         for spp, methods in jobs:
-            for method, picture in methods:
-                key = {"scene": scene.name, "spp": spp, "method": method, **results.model_of(method)}
+            for method, model, picture in methods:
+                key = {"scene": scene.name, "spp": spp, "method": method} | ({"model": model} if model else {})
                 rows.append(key | scores(picture(), scene.reference))
     return rows
 

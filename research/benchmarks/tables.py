@@ -343,14 +343,14 @@ CONFIDENCE = Table(
 INPUTS = {
     "OIDN": ("one render", "OIDN"),
     "OIDN prefiltered": ("one render", "OIDN, prefiltered"),
-    "joint-x1": ("one render", "`--quality balanced`"),
-    "joint-large-x1": ("one render", "`--quality best`"),
+    "balanced-x1": ("one render", "`--quality balanced`"),
+    "best-x1": ("one render", "`--quality best`"),
     "joint-x2": ("two sizes", "`--quality balanced`"),
     "joint-large-x2": ("two sizes", "`--quality best`"),
     f"OIDN{SEEDS}": ("two seeds", "OIDN on their mean"),
     f"OIDN prefiltered{SEEDS}": ("two seeds", "OIDN on their mean, prefiltered"),
-    f"joint-x1{SEEDS}": ("two seeds", "`--quality balanced`"),
-    f"joint-large-x1{SEEDS}": ("two seeds", "`--quality best`"),
+    f"balanced-x1{SEEDS}": ("two seeds", "`--quality balanced`"),
+    f"best-x1{SEEDS}": ("two seeds", "`--quality best`"),
 }
 
 ONE_RENDER_OR_TWO = Table(

@@ -555,6 +555,12 @@ def test_a_frame_that_flashes_stands_alone_and_is_named(tmp_path, bilinear_model
     assert f"a pixel counts {sum(counted.values()) / 5:.1f} frames" in report.temporal_text
 
 
+def test_no_more_frames_count_than_a_shot_has(tmp_path, bilinear_models):
+    shot = make_moving_shot(tmp_path / "shot", standing, 3, layers=())
+    report = run(shot, bilinear_models[4], "short")
+    assert 2 < report.frames_counted <= 3
+
+
 def test_the_order_of_a_part_begins_with_its_neighbours():
     frames = {n: FrameFiles(n, None, None, None) for n in (1, 2, 3, 5, 6, 7, 8, 9)}
     plan = ShotPlan(frames, {None: ViewPlan(Reach(1, 1))})

@@ -36,8 +36,8 @@ def test_scores_are_those_of_the_definitions():
 
 def test_two_seeds_are_averaged_by_their_samples():
     scene = SimpleNamespace(hrls=lambda spp: Render.from_arrays("", rgb=np.full_like(GREY, spp)))
-    name, picture_of = next(one_size.of_two(scene, {1: []}, (1, 3)))
-    assert name == "render, two seeds" and (picture_of() == (1 * 1 + 3 * 3) / 4).all()
+    name, model, picture_of = next(one_size.of_two(scene, (1, 3)))
+    assert (name, model) == ("render, two seeds", None) and (picture_of() == (1 * 1 + 3 * 3) / 4).all()
 
 
 def test_black_references_and_lamps_keep_scores_finite():

@@ -140,13 +140,16 @@ def time_frame(args: argparse.Namespace) -> list[Row]:
 def time_command(args: argparse.Namespace) -> list[Row]:
     """Time whole commands: read files, fuse or denoise, write."""
     from oiio_msspl.model.catalogue import find_model
+    from oiio_msspl.model.contract import ONE_SIZE
 
     width, height = args.size
     with tempfile.TemporaryDirectory() as folder:
-        low, high = write_pair(Path(folder), width, height, args.scale)
-        fuse = [str(Path(sys.executable).with_name("msspl-fuse")), str(low), str(high), "-o", f"{folder}/out.exr"]
+        pair = write_pair(Path(folder), width, height, args.scale)
+        files, high = pair[args.scale == ONE_SIZE :], pair[1]  # one render, or two of two sizes
+        fuse = [str(Path(sys.executable).with_name("msspl-fuse")), *map(str, files), "-o", f"{folder}/out.exr"]
         fuse += ["--overwrite", "--no-preview"]
-        jobs = {find_model(args.scale, name).stem: [*fuse, "--model", name] for name in args.quality}
+        models = [find_model(args.scale, name).stem for name in args.quality]
+        jobs = {model: [*fuse, "--model", model] for model in models}
         jobs[OIDN_PREFILTERED] = [sys.executable, "-m", "research.benchmarks.oidn", str(high), f"{folder}/oidn.exr"]
         runs = timer.in_turn(jobs, args.rounds)
     size = {"size": f"{width}x{height}", "scale": args.scale}
@@ -219,7 +222,7 @@ def time_render(args: argparse.Namespace) -> list[Row]:
 #: Question -> how it is measured, the columns that tell its rows apart, and the size of the frame.
 QUESTIONS = {
     "frame": (time_frame, ("method", "machine"), "1024x1024"),
-    "command": (time_command, ("method", "size", "machine"), "1920x1080"),
+    "command": (time_command, ("method", "size", "scale", "machine"), "1920x1080"),
     "shots": (time_shots, ("quality", "temporal", "machine"), "1920x1080"),
     "render": (time_render, ("scene", "machine"), "1024x1024"),
 }
@@ -231,7 +234,7 @@ def main() -> None:
     parser.add_argument("question", choices=QUESTIONS)
     parser.add_argument("scenes", type=Path, nargs="?", help="render: the folder of scenes")
     parser.add_argument("--size", metavar="WxH")
-    parser.add_argument("--scale", type=int, default=2)
+    parser.add_argument("--scale", type=int, default=2, help="of the pair; 1 for one render")
     parser.add_argument("--rounds", type=int, default=3, help="times that all are measured, in turn")
     parser.add_argument("--quality", nargs="+", default=["fast", "balanced", "best", "paper"], help="or models")
     parser.add_argument("--methods", metavar="PATTERN", default="*", help="frame: measure only these")

@@ -84,20 +84,29 @@ PAIRS = (
     "LRHS scaled down: lanczos3",
     "exposure one stop up",
 )
-NEEDS = {ON_HRLS: "HRLS", SAME_SAMPLES: "all samples at full resolution"}
+NEEDS = {ON_HRLS: "HRLS", SAME_SAMPLES: "one render with all samples"}
 
 
+#: Method of :mod:`research.benchmarks.one_size` -> the model whose time is measured.
+ON_ONE_RENDER = {"balanced-x1": "joint-x1", "best-x1": "joint-large-x1"}
 WHEN_IT_PAYS = Table(
-    ("accuracy", "time_command"),
+    ("accuracy", "one_size", "time_command"),
     (*BY_SCENE, "size"),
     ("method", "needs"),
     [
-        Line([METHODS[m], NEEDS.get(m, "LRHS and HRLS")], {"method": m})
-        for m in (FAST, BALANCED, BEST, ON_HRLS, SAME_SAMPLES, "paper-x2")
+        *(
+            Line([METHODS[m], NEEDS.get(m, "LRHS and HRLS")], {"source": "accuracy", "method": m})
+            for m in (BALANCED, BEST)
+        ),
+        *(
+            Line([f"`--quality {m.removesuffix('-x1')}`", NEEDS[SAME_SAMPLES]], {"source": "one_size", "method": m})
+            for m in ON_ONE_RENDER
+        ),
+        *(Line([METHODS[m], NEEDS[m]], {"source": "accuracy", "method": m}) for m in (ON_HRLS, SAME_SAMPLES)),
     ],
     [
         *(
-            Column(f"{title}, {spp} spp", title.lower(), {"source": "accuracy", "scene": MEAN, "spp": spp})
+            Column(f"{title}, {spp} spp", title.lower(), {"scene": MEAN, "spp": spp})
             for title, spp in itertools.product(("PSNR", "RelMSE"), (2, 8))
         ),
         Column(
@@ -105,7 +114,7 @@ WHEN_IT_PAYS = Table(
             "seconds",
             {"source": "time_command", "size": "1920x1080"},
             form="{:.0f}",
-            renamed=SAME_WORK,
+            renamed=SAME_WORK | ON_ONE_RENDER,
         ),
     ],
 )

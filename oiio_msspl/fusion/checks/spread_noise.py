@@ -63,8 +63,8 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
                 for image in (box_downsample(high, scale), low, high)
             )
             difference = low - mean
-            dense = _blocks(np.abs(difference) > ROUNDING).mean(axis=1) > DENSE
-            correlations.append((_correlations(_blocks(high)), _correlations(_blocks(difference)[dense])))
+            dense = blocks_of(np.abs(difference) > ROUNDING).mean(axis=1) > DENSE
+            correlations.append((_correlations(blocks_of(high)), _correlations(blocks_of(difference)[dense])))
     hrls, difference = (np.concatenate(parts) for parts in zip(*correlations, strict=True))
     if lr is hr:
         return None if len(hrls) < FEWEST else bool(np.quantile(hrls, LEAST_CORRELATED) > SPREAD_HRLS)
@@ -84,17 +84,22 @@ def sample_windows(grid: Window) -> list[Window]:
     return [Window(x, y, x + width, y + height) for y in rows for x in columns]
 
 
-def _blocks(image: NDArray[T]) -> NDArray[T]:
+def blocks_of(image: NDArray[T]) -> NDArray[T]:
     """Return the whole blocks of an image (h, w), (n, BLOCK^2)."""
     rows, columns = (side // BLOCK for side in image.shape)
     blocks = image[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
     return blocks.swapaxes(1, 2).reshape(-1, BLOCK**2)
 
 
+def noise_in(blocks: Array) -> NDArray[np.float64]:
+    """Return blocks (n, BLOCK, BLOCK) without their smooth course; black and blown-out ones have no noise."""
+    residual = (blocks.astype(np.float64) @ _without_course()).reshape(-1, BLOCK, BLOCK)
+    return np.asarray(residual[residual.var(axis=(1, 2)) > 1e-8])
+
+
 def _correlations(blocks: Array) -> NDArray[np.float64]:
     """Return the correlation of neighbouring pixels in each block (n, BLOCK^2), without its smooth course."""
-    residual = (blocks.astype(np.float64) @ _without_course()).reshape(-1, BLOCK, BLOCK)
-    residual = residual[residual.var(axis=(1, 2)) > 1e-8]  # black and blown-out blocks have no noise
+    residual = noise_in(blocks)
     across = (residual[:, :, 1:] * residual[:, :, :-1]).mean(axis=(1, 2))
     down = (residual[:, 1:] * residual[:, :-1]).mean(axis=(1, 2))
     result: NDArray[np.float64] = (across + down) / 2 / np.square(residual).mean(axis=(1, 2))

@@ -46,8 +46,8 @@ OTHER_BRIGHTNESS = 4 / 5**0.5
 #: There, a neighbour counts less by this, too. It lacks some pixels, so the noise changes from pixel to pixel, and the
 #: network takes single noisy pixels for detail.
 BESIDE_HIDDEN = np.float32(0.7)
-#: Renders are clean if the variance of the noise of an HRLS pixel is less than this, relative to the light: 12 spp. With
-#: more noise, albedo and normals are noisy, too, and gain more by the average than they lose.
+#: Renders are clean if the variance of the noise of an HRLS pixel is less than this, relative to the light: 12 spp.
+#: With more noise, albedo and normals are noisy, too, and gain more by the average than they lose.
 CLEAN = 0.08
 #: A neighbour's nearest pixel lies up to half a pixel beside the surface, where the albedo may differ. In clean renders
 #: that shows, so light is corrected by the ratio of the albedos up to this factor. ``DARK_ALBEDO`` is added to both.

@@ -46,7 +46,7 @@ SHOWN = {
         24,
     ),
     "msspl_render": (
-        "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output "
+        "--view-layer --max-memory --blender --renders --scale --lr-spp --hr-spp --components --quality --device --output "
         "--layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
         "--help --help-all --version",
         11,
@@ -90,7 +90,7 @@ def test_submit_has_the_options_of_msspl_fuse_that_a_job_can_have():
         for program, command in (("msspl_fuse", ()), ("msspl", ("submit",)))
     )
     assert fuse - submit == {"--overwrite", "--json", "--report", "--progress", "--scheduler"}
-    assert submit - fuse == {"--bundle", "--chunk", "--timeout"}
+    assert submit - fuse == {"--bundle", "--chunk", "--command", "--conda", "--name", "--rez", "--timeout"}
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")

@@ -3,10 +3,10 @@
 
     python -m research.training.same_size oiio_msspl/model/weights/joint-x2.onnx
 
-This writes ``joint-x1.onnx`` and ``joint-clean-x1.onnx`` beside the file for CPUs and, in the folder `gpu`, beside that
-for GPUs. Nothing is trained: the networks and their weights are those of the model at x2, and only what comes before
-them changes. In the first model, the mean of both renders takes the place of the HRLS, and the mean at half of the size
-that of the LRHS. The second one, for renders with little noise, is the denoiser of that mean alone, at full size; that
+This writes ``joint-x1.onnx`` beside the file for CPUs and, in the folder `gpu`, beside that for GPUs. Nothing is
+trained: the networks and their weights are those of the model at x2, and only what comes before them changes. The mean
+of both renders takes the place of the HRLS, and the mean at half of the size that of the LRHS. With ``--clean``, it
+also writes ``joint-clean-x1.onnx`` for renders with little noise: the denoiser of that mean alone, at full size. That
 of ``joint-large`` reads albedo and normal that are denoised before. Run :mod:`research.training.share` afterwards, so
 that the weights lie once.
 """
@@ -38,6 +38,8 @@ from research.training.whole_model import ENTER, Enter, encoded, example
 #: What comes out of :class:`EnterHalves` and of :class:`EnterMean`; ``encoded.`` precedes these names in the graph.
 HALVES = ("lrhs", "hrls", "colour", "noise", "albedo", "normal")
 MEAN = ("hrls", "colour", "noise", "albedo", "normal")
+#: Peak memory of a tile in bytes for each of its pixels, if the denoiser of the mean runs at full size.
+BYTES_PER_PIXEL = 1160
 #: Height and width at x2 of a pixel of the LRHS.
 SCALE = 2
 
@@ -50,7 +52,7 @@ class EnterHalves(Enter):
     """
 
     def forward(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return the values of ``ENTERED``."""
+        """Return the values of ``HALVES``."""
         lrhs, hrls, shares = self.exposed(inputs)
         mean = _mean(lrhs, hrls, shares)
         low, high = ({name: box_downsample(image, SCALE) for name, image in x.items()} for x in (lrhs, hrls))
@@ -88,8 +90,9 @@ def same_size_model(path: Path, clean: bool) -> onnx.ModelProto:
     """Return the model for renders of one size, or that for those with little noise, given a `joint` model at x2."""
     model, contract = onnx.load(path, load_external_data=False), Contract.of_file(path)
     family = contract.name.rpartition("-x")[0] + (CLEAN if clean else "")
+    memory = BYTES_PER_PIXEL if clean else contract.bytes_per_pixel
     contract = replace(
-        contract, name=f"{family}-x1", scale=ONE_SIZE, training_spp={},
+        contract, name=f"{family}-x1", bytes_per_pixel=memory, scale=ONE_SIZE, training_spp={},
         alignment=SCALE * contract.alignment, overlap=SCALE * contract.overlap,
         provenance=contract.provenance | {"made_from": contract.name},
     )  # fmt: skip
@@ -157,9 +160,10 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, help="file for CPUs of a joint model at x2")
+    parser.add_argument("--clean", action="store_true", help="also write the model for renders with little noise")
     args = parser.parse_args()
     for source in filter(None, (args.model, gpu_file(args.model))):
-        for clean in (False, True):
+        for clean in (False, True)[: 1 + args.clean]:
             model = same_size_model(source, clean)
             file = source.with_name(f"{model.graph.name}.onnx")
             onnx.save(model, file)

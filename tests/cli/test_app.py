@@ -46,8 +46,8 @@ SHOWN = {
         24,
     ),
     "msspl_render": (
-        "--view-layer --max-memory --blender --renders --scale --lr-spp --hr-spp --components --quality --device --output "
-        "--layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
+        "--view-layer --max-memory --blender --renders --scale --lr-spp --hr-spp --components --quality --device "
+        "--output --layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
         "--help --help-all --version",
         11,
     ),

@@ -65,7 +65,7 @@ def test_the_node_shows_what_matters(host, tmp_path):
 def test_a_mistake_in_the_options_is_a_sentence(host):
     fuse(host, "fuse_frame", options="--nope")
     (message,) = host.messages
-    assert message.startswith("MSSPLFuse1: No such option")
+    assert message.startswith(("MSSPLFuse1: No such option: --nope", "MSSPLFuse1: No such option '--nope'."))
     assert not set(message) & set("╭─╮│╰╯\n")
 
 

@@ -144,10 +144,16 @@ def test_black_beside_light_of_the_lrhs_is_not_empty():
     assert empty[:6].all() and empty[12:].all()
 
 
-def test_a_firefly_beside_a_lamp_is_dimmed_by_its_own_lrhs_pixel():
-    """The lamp in the next pixel does not make it believable."""
+def wall_with_lamp():
+    """Both renders, in which a lamp covers one LRHS pixel."""
     low, high = np.full((8, 8, 3), 0.5, np.float32), np.full((16, 16, 3), 0.5, np.float32)
     low[4, 4], high[8:10, 8:10] = 2 * LIGHT, 2 * LIGHT
+    return low, high
+
+
+def test_a_firefly_beside_a_lamp_is_dimmed_by_its_own_lrhs_pixel():
+    """The lamp in the next pixel does not make it believable."""
+    low, high = wall_with_lamp()
     high[8, 10] = 2 * LIGHT
     lights = bright_lights(low, high, 1.0)
     assert (lights[8:10, 8:10] == 2 * LIGHT).all()
@@ -155,8 +161,7 @@ def test_a_firefly_beside_a_lamp_is_dimmed_by_its_own_lrhs_pixel():
 
 
 def test_a_firefly_in_a_lamp_gets_no_more_than_the_lamp():
-    low, high = np.full((8, 8, 3), 0.5, np.float32), np.full((16, 16, 3), 0.5, np.float32)
-    low[4, 4], high[8:10, 8:10] = 2 * LIGHT, 2 * LIGHT
+    low, high = wall_with_lamp()
     high[9, 9] = 1000 * LIGHT
     lights = bright_lights(low, high, 1.0)
     assert (lights[8:10, 8:10] == 2 * LIGHT).all()

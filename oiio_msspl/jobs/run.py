@@ -24,6 +24,7 @@ from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
 from oiio_msspl.fusion.motion.shot import ShotMotion
 from oiio_msspl.fusion.motion.source import MotionFrame
+from oiio_msspl.fusion.neighbours.alone import fuse_alone
 from oiio_msspl.fusion.neighbours.average import average_renders, average_results
 from oiio_msspl.fusion.neighbours.hops import find_hops
 from oiio_msspl.fusion.neighbours.path import Hop
@@ -147,7 +148,6 @@ class ShotRun:
             if frame.number in self._wanted:
                 self._fuse_others(frame)
             frame.fused = self.fuse(frame)
-            frame.averaged = RenderPair(*frame.stored)
             frame.state = State.FUSED
             if frame.plan.reach.results:
                 frame.keep_result()
@@ -188,7 +188,11 @@ class ShotRun:
             held=frame.held_bytes,
             progress=frame.progress,
         )
-        fused.frames = frame.frame_counts
+        frame.averaged, fused.frames = RenderPair(*frame.stored), frame.frame_counts
+        cache_bytes = strips_memory(self.settings.max_memory, frame.held_bytes)
+        fuse_alone(
+            frame.renders, fused, frame.session, share=_share_by_spp(frame.lr, frame.hr), cache_bytes=cache_bytes
+        )
         return fused
 
     def _stop_at_error(self, frame: ShotFrame) -> None:

@@ -39,7 +39,7 @@ from oiio_msspl.model.contract import ONE_SIZE
 COVERED = 0.9
 #: A neighbour counts less near objects that move and are not followed: the less, the more of the HRLS pixels up to
 #: ``NEAR_OBJECTS`` away on each side show them, and not at all from the share ``FEW`` on.
-NEAR_OBJECTS, FEW = 32, 0.125
+NEAR_OBJECTS, FEW = 8, 0.125
 #: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided
 #: by the root of the product. That is a factor of 5.
 OTHER_BRIGHTNESS = 4 / 5**0.5

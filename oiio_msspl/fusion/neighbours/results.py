@@ -25,6 +25,8 @@ from oiio_msspl.image.sampling import sample_cubic
 
 #: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.
 DIFFERENT_MIX = 0.3
+#: Neighbours may count fully where the average of renders counts this many frames.
+COMPANY = 1.25
 
 Images = dict[str, Array]
 
@@ -46,6 +48,8 @@ class ResultBand:
         for name, image in target.items():
             image[:] = self._own[name][self._rows]
         self._sum = WeightedSum(target)
+        #: How much neighbours may count: not at all where none counts in the average of renders.
+        self._company = None if frame.frames is None else _company(frame.frames[area.slices(self._window)][..., 0])
         #: Where the frame may show two surfaces, by the motion to the nearest neighbour on a side.
         self._borders: Mask
 
@@ -61,6 +65,8 @@ class ResultBand:
         weight = from_grid(alignment, judge(picture), area) * path.valid
         if path.x is not None:
             weight *= self._light.moved_weight
+        if self._company is not None:
+            weight *= self._company
         mixed = self._borders | _borders_at(hop, path)
         here, there = (luminance(images[RGB][mixed]) for images in (self._own, warped))
         weight[mixed] *= likeness(here, there, self._light.darkest, DIFFERENT_MIX)
@@ -71,6 +77,11 @@ class ResultBand:
     def finish(self) -> Array:
         """Turn the sums into means, and return the number of frames."""
         return self._sum.divide()
+
+
+def _company(frames: Array) -> Array:
+    """Return how much neighbours may count (h, w), from 0 to 1, by the number of frames that renders average."""
+    return np.clip((frames - 1) / np.float32(COMPANY - 1), 0, 1)
 
 
 def _borders_at(hop: Hop[FusedFrame], path: Path) -> Mask:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,6 +17,7 @@ from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.alpha import fuse_alpha
 from oiio_msspl.fusion.tiles.guards import LAYER_REACH, black_in_both, check_finite, repeated
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile
+from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
 from oiio_msspl.image.filters import box_downsample, enlarged
@@ -73,10 +74,13 @@ class TileTask:
 
 
 def tile_tasks(
-    pair: FramePair, result: FusedPixels, threads: Callable[[], AbstractContextManager[object]] = nullcontext
+    pair: FramePair,
+    result: FusedPixels,
+    threads: Callable[[], AbstractContextManager[object]] = nullcontext,
+    tiles: Sequence[Tile] | None = None,
 ) -> Iterator[TileTask]:
-    """Prepare the tiles of a frame, one after the other, each inside of ``threads()``."""
-    tiles = pair.tiles()
+    """Prepare the tiles of a frame, or some of them, one after the other, each inside of ``threads()``."""
+    tiles = pair.tiles() if tiles is None else tiles
     with threads():
         shares = pair.sample_shares()
     for number, tile in enumerate(tiles, start=1):

@@ -86,9 +86,9 @@ class FramePair:
         renders = (("lrhs", self._lrhs_counts), ("hrls", self._hrls_counts))
         return {f"{which}.{name}": n for which, counts in renders for name, n in getattr(counts, kind).items()}
 
-    def tiles(self) -> list[Tile]:
-        """Return the tiles in which the pair is fused. A pass is black where none of them is."""
-        return plan_tiles(self.grid, self._contract, self._part)
+    def tiles(self, part: Window | None = None) -> list[Tile]:
+        """Return the tiles of the grid, or of a part of it. A pass is black where none of them is."""
+        return plan_tiles(self.grid, self._contract, part or self._part)
 
     def prepare(self, tile: Tile) -> PreparedTile:
         """Read a tile and apply the guards."""

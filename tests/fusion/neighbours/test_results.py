@@ -43,6 +43,15 @@ def test_four_still_neighbours_halve_the_error():
     assert np.median(result.frames) > 4
 
 
+def test_what_stands_alone_in_the_average_of_renders_keeps_its_bits():
+    frames = [frame_of(texture(), seed) for seed in range(3)]
+    counts = frames[0].frames = np.full((HEIGHT, WIDTH, 1), 2, np.float32)
+    counts[30:60, 40:80] = 1
+    result = average_results(frames[0], [still(frames[1])], [still(frames[2])])
+    same = (result.rgb == frames[0].rgb).all(axis=-1)
+    assert same[30:60, 40:80].all() and np.mean(same) < 0.15
+
+
 def test_neighbours_are_found_where_their_surfaces_are():
     frames = {n: frame_of(texture(1.7 * n), n + 5) for n in (-2, -1, 0, 1, 2)}
     before, after = ([moved(frames[n], 1.7 * np.sign(n)) for n in numbers] for numbers in ((-1, -2), (1, 2)))

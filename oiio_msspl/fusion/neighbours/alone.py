@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fuses places of a frame again, from its own renders: those where no neighbour counts.
+
+A network tells noise from detail by what is around. Where averages of many frames surround pixels of one frame, it
+leaves their noise in. So such pixels become those that the frame has without neighbours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.neighbours.bands import for_bands, to_grid
+from oiio_msspl.fusion.neighbours.renders import RenderPair
+from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
+from oiio_msspl.fusion.tiles.prepare import FramePair
+from oiio_msspl.fusion.tiles.tiling import Tile
+from oiio_msspl.image.arrays import Array, Mask, blank, unload
+from oiio_msspl.image.filters import all_within, grown
+from oiio_msspl.image.parallel import limit_threads
+from oiio_msspl.model.session import Session
+
+#: Up to the first number of frames a pixel stands alone, from the second on it does not. In between, both pictures are
+#: mixed.
+ALONE, AVERAGED = 1.02, 1.2
+#: Places are fused again that hold a square of this many HRLS pixels on a side.
+SMALLEST = 9
+
+
+def fuse_alone(
+    pair: RenderPair, frame: FusedFrame, session: Session, *, share: float | None = None, cache_bytes: int = 0
+) -> None:
+    """Replace the pixels of a frame that stand alone by those that its own renders give.
+
+    Args:
+        pair: the frame's own renders.
+        frame: fused from the averages of its renders with those of its neighbours; ``frames`` counts them. Its colour,
+            alpha, error and trust change.
+        session: the model.
+        share: see :func:`oiio_msspl.fusion.fuse.fuse`.
+        cache_bytes: for decoded rows that several places read.
+
+    Raises:
+        InputError: pixels can't be decoded.
+        MssplError: the network failed, or returned NaN or infinite values.
+    """
+    alignment, counts = frame.alignment, frame.frames
+    if counts is None:
+        return
+    window, seconds = alignment.hr_data_window, session.seconds
+    alone = np.concatenate(
+        for_bands(alignment, lambda core, _: to_grid(alignment, _alone(counts[core.slices(window)]), core))
+    )[..., 0]
+    reach = max(1, SMALLEST // 2 // alignment.scale)
+    places = grown(all_within(alone >= 0.5, reach), reach)
+    if not places.any() or alone.min() == 1:  # a frame that stands alone was fused from its own renders
+        return
+    with limit_threads(session.threads), pair.hr.cache_strips(cache_bytes):
+        own = FramePair(pair.lr, pair.hr, alignment, session.contract, share=share)
+        error: Array | None = None if frame.error is None else blank(frame.error.shape)
+        result = FusedPixels(blank(frame.rgb.shape), None, error, alignment, own.exposure)
+        result.trust = None if frame.trust is None else frame.trust.copy()
+        for task in fuse_tiles(tile_tasks(own, result, tiles=_tiles(own, places, alignment.grid)), session):
+            target = task.tile.features.hrls_target.slices(window)
+            weight = _alone(counts[target])
+            for image, new in ((frame.rgb, result.rgb), (frame.alpha, result.alpha), (frame.error, result.error)):
+                if image is not None and new is not None:
+                    image[target] += weight * (new[target] - image[target])
+                    unload(image)
+                    unload(new)
+            del task  # or its memory would be held while the next one is fused
+        if frame.trust is not None and result.trust is not None:
+            frame.trust += alone * (result.trust - frame.trust)
+    session.release_memory()
+    frame.seconds += session.seconds - seconds
+
+
+def _alone(frames: Array) -> Array:
+    """Return how much pixels that are averages of so many frames stand alone, from 0 to 1."""
+    return np.clip((AVERAGED - frames) / np.float32(AVERAGED - ALONE), 0, 1)
+
+
+def _tiles(own: FramePair, places: Mask, grid: Window) -> list[Tile]:
+    """Return the tiles that cover all places (h, w) of a grid: each tile of the frame without its empty margins."""
+    tiles = []
+    for whole in own.tiles():
+        core = whole.core.intersect(grid)
+        rows, columns = (np.flatnonzero(places[core.slices(grid)].any(axis=axis)) for axis in (1, 0))
+        if len(rows):
+            part = Window(columns[0], rows[0], columns[-1] + 1, rows[-1] + 1).shift(core.x0, core.y0)
+            tiles += own.tiles(part)
+    return tiles

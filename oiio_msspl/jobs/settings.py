@@ -12,7 +12,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.checks.noise_level import has_little_noise
+from oiio_msspl.fusion.checks.noise_level import has_clean_aovs, has_little_noise
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
@@ -151,13 +151,13 @@ def family_for_noise(
 
     It is a key of ``NOISE``; "" for noise that needs no counterpart, and None without noise. Noise that the pixel
     filter has spread needs weights of its own. In renders of one size with little noise, the denoiser of their mean
-    alone is more accurate.
+    alone is more accurate. That of ``best`` denoises albedo and normal before; another one needs clean ones.
     """
     spread = is_noise_spread(lr, hr, alignment)
     if spread:
         return family + SPREAD, SPREAD
     clean = for_little_noise(family) if alignment.scale == ONE_SIZE else None
-    if clean and has_little_noise(lr, hr, alignment):
+    if clean and has_little_noise(lr, hr, alignment) and (family == QUALITIES["best"] or has_clean_aovs(hr, alignment)):
         return clean, CLEAN
     return family, None if spread is None else ""
 

@@ -64,7 +64,8 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
             )
             difference = low - mean
             dense = blocks_of(np.abs(difference) > ROUNDING).mean(axis=1) > DENSE
-            correlations.append((_correlations(blocks_of(high)), _correlations(blocks_of(difference)[dense])))
+            blocks = blocks_of(high), blocks_of(difference)[dense]
+            correlations.append([correlations_in(noise_in(part)) for part in blocks])
     hrls, difference = (np.concatenate(parts) for parts in zip(*correlations, strict=True))
     if lr is hr:
         return None if len(hrls) < FEWEST else bool(np.quantile(hrls, LEAST_CORRELATED) > SPREAD_HRLS)
@@ -97,9 +98,8 @@ def noise_in(blocks: Array) -> NDArray[np.float64]:
     return np.asarray(residual[residual.var(axis=(1, 2)) > 1e-8])
 
 
-def _correlations(blocks: Array) -> NDArray[np.float64]:
-    """Return the correlation of neighbouring pixels in each block (n, BLOCK^2), without its smooth course."""
-    residual = noise_in(blocks)
+def correlations_in(residual: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the correlation (n) of neighbouring pixels in each block (n, BLOCK, BLOCK) of :func:`noise_in`."""
     across = (residual[:, :, 1:] * residual[:, :, :-1]).mean(axis=(1, 2))
     down = (residual[:, 1:] * residual[:, :-1]).mean(axis=(1, 2))
     result: NDArray[np.float64] = (across + down) / 2 / np.square(residual).mean(axis=(1, 2))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.checks.averages import BRIGHTEST
+from oiio_msspl.fusion.checks.noise_level import has_clean_aovs
 from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
 from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
@@ -46,8 +47,8 @@ OTHER_BRIGHTNESS = 4 / 5**0.5
 #: There, a neighbour counts less by this, too. It lacks some pixels, so the noise changes from pixel to pixel, and the
 #: network takes single noisy pixels for detail.
 BESIDE_HIDDEN = np.float32(0.7)
-#: Renders are clean if the variance of the noise of an HRLS pixel is less than this, relative to the light: 12 spp.
-#: With more noise, albedo and normals are noisy, too, and gain more by the average than they lose.
+#: Renders may be clean if the variance of the noise of an HRLS pixel is less than this, relative to the light: 12 spp.
+#: If albedo and normals are noisy, they gain more by the average than they lose.
 CLEAN = 0.08
 #: A neighbour's nearest pixel lies up to half a pixel beside the surface, where the albedo may differ. In clean renders
 #: that shows, so light is corrected by the ratio of the albedos up to this factor. ``DARK_ALBEDO`` is added to both.
@@ -92,6 +93,11 @@ class RenderPair:
             return even_and_odd(high)
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
         return _bounded(lrhs), high
+
+    @cached_property
+    def has_clean_aovs(self) -> bool:
+        """Whether albedo and normal need no average: where the HRLS has moved, that would only blur them."""
+        return has_clean_aovs(self.hr, self.alignment)
 
     def unload(self) -> None:
         """Give the memory of pixels that wait in temporary files back to the system."""
@@ -149,8 +155,8 @@ class RenderBand:
         self._high_images = {name: image[core.slices(alignment.hr_data_window)] for name, image in high.items()}
         for name, values in read(pair.hr, core, self._names).items():
             self._high_images[name][:] = values
-        # Half of the noise of the mean of both renders is that of the HRLS. Clean albedo and normals need no average.
-        clean = 2 * light.noise * alignment.scale**2 < CLEAN
+        # Half of the noise of the mean of both renders is that of the HRLS.
+        clean = 2 * light.noise * alignment.scale**2 < CLEAN and pair.has_clean_aovs
         own = (ALBEDO, NORMAL) if clean else ()
         self._albedo = repair(self._high_images[ALBEDO])[0] if clean and ALBEDO in self._names else None
         self._high = WeightedSum({name: image for name, image in self._high_images.items() if name not in own})

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -25,8 +26,10 @@ from oiio_msspl.jobs.plan import ShotPlan, TemporalOptions, plan_temporal
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, find_shot
 from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.model.contract import ONE_SIZE
 from research.benchmarks.peers import oidn, oidn_prefiltered, oidn_split
 from research.benchmarks.shots.sequence import Sequence as MovingSequence
+from research.benchmarks.shots.sequence import write_one_render
 
 ALONE, NEIGHBOURS = "frame by frame", "with neighbours"
 OIDN, OIDN_BEST, OIDN_SPLIT = "OIDN", "OIDN prefiltered", "OIDN on every second pixel"
@@ -42,7 +45,7 @@ class Made:
 
     method: str
     scale: int
-    """Of the LRHS; 1 for what reads none."""
+    """Of the LRHS; 1 for what reads the full-resolution render with all samples."""
     images: Array
     """Linear (frames, h, w, 3)."""
     motion: str = ""
@@ -54,6 +57,8 @@ def all_methods(
 ) -> Iterator[Made]:
     """Yield each method on a sequence whose name matches the pattern.
 
+    Ours fuse pairs, and at a scale of 1 the full-resolution render that OIDN gets.
+
     OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
     are averaged exactly as ours are with `best`. The test of the light gets the same LRHS. ``options`` say which
     neighbours are averaged. If a pixel filter has ``spread`` the noise, OIDN also reads every second pixel.
@@ -63,10 +68,11 @@ def all_methods(
     for name, denoised in peers.items():
         if fnmatchcase(name, pattern):
             yield Made(name, 1, np.stack([denoised(render) for render in full]))
-    for scale in SCALES:
-        for name, run in _by_scale(sequence, scale, options, spread):
-            if fnmatchcase(name, pattern):
-                yield Made(name, scale, _images(run), _motion(run.plan) if run.plan.count else "")
+    with tempfile.TemporaryDirectory() as folder:
+        for scale in (ONE_SIZE, *SCALES):
+            for name, run in _by_scale(sequence, scale, options, Path(folder), spread=spread):
+                if fnmatchcase(name, pattern):
+                    yield Made(name, scale, _images(run), _motion(run.plan) if run.plan.count else "")
 
 
 class _RunOfPeer(ShotRun):
@@ -92,21 +98,26 @@ class _RunOfPeer(ShotRun):
 
 
 def _by_scale(
-    sequence: MovingSequence, scale: int, options: TemporalOptions, spread: bool
+    sequence: MovingSequence, scale: int, options: TemporalOptions, folder: Path, *, spread: bool
 ) -> Iterator[tuple[str, ShotRun]]:
-    """Yield the methods that read an LRHS: the name, and how a shot is fused."""
-    folder = sequence.folder
-    shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
+    """Yield the methods for a scale: the name, and how a shot is fused. ``folder`` is for files that they read."""
+    one = scale == ONE_SIZE
+    if one:
+        for n in sequence.numbers:
+            write_one_render(sequence, n, folder / f"one.{n:04d}.exr")
+    lr = None if one else sequence.folder / f"lr_x{scale}.####.exr"
+    hr = folder / "one.####.exr" if one else sequence.folder / "hr.####.exr"
+    shot = find_shot(lr, hr, sequence.folder / "fused.####.exr")
     for quality, prefix in QUALITIES.items():
         # More threads only wait for each other: the pictures are small.
         settings = Settings(model=model_of_shot(shot, InputOptions(), quality), threads=1)
         plan = plan_temporal(shot, InputOptions(), options, settings.model)
         yield prefix + ALONE, ShotRun(settings, ShotPlan(), shot.frames)
         yield prefix + NEIGHBOURS, ShotRun(settings, plan, shot.frames)
-    # The peers' frames have the neighbours of the last quality, `best`.
+    # The peers' frames have the neighbours of the last quality, `best`, and the LRHS of a pair tests their light.
     peers = {OIDN_NEIGHBOURS: oidn_prefiltered} | ({OIDN_SPLIT_NEIGHBOURS: oidn_split} if spread else {})
-    for name, denoised in peers.items():
-        yield name, _RunOfPeer(denoised, folder, settings, plan, shot.frames)
+    for name, denoised in () if one else peers.items():
+        yield name, _RunOfPeer(denoised, sequence.folder, settings, plan, shot.frames)
 
 
 def _motion(plan: ShotPlan) -> str:

@@ -99,6 +99,16 @@ def without_vectors(sequence: Sequence, folder: Path) -> Sequence:
     return replace(sequence, folder=target)
 
 
+def write_one_render(sequence: Sequence, number: int, path: Path) -> None:
+    """Write the full-resolution render of a frame, with the motion vectors of its HRLS."""
+    files = [str(sequence.folder / f"{kind}.{number:04d}.exr") for kind in ("full", "hr")]
+    with OpenEXR.File(files[0], separate_channels=True) as full, OpenEXR.File(files[1], separate_channels=True) as hr:
+        channels = hr.channels() | full.channels()
+        pixels = {name: channel.pixels for name, channel in channels.items() if name in {*full.channels(), *MOTION}}
+        with OpenEXR.File(full.header(), pixels) as written:
+            written.write(str(path))
+
+
 def _channels(path: Path) -> dict[str, Array]:
     """Return all channels (h, w) of a file, by name."""
     image: Any = oiio.ImageBuf(str(path))

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether albedo and normal are clean is told by their edges, and not by the noise of the light."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl.exr.render import Render
+from oiio_msspl.fusion.checks.noise_level import has_clean_aovs
+from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.image.filters import box_downsample
+from oiio_msspl.jobs.settings import family_for_noise
+
+SIZE = 96
+
+
+def checks(samples, seed=1):
+    """The albedo (h, w, 3) of a turned checkerboard, with so many samples in each pixel."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:SIZE, :SIZE][..., None] + rng.random((2, SIZE, SIZE, samples))
+    board = (np.floor((x + 0.4 * y) / 14) + np.floor((y - 0.4 * x) / 14)) % 2
+    return np.repeat(0.2 + 0.5 * board.mean(axis=-1, keepdims=True), 3, axis=-1).astype(np.float32)
+
+
+def render_of(albedo, light=0.0, seed=2):
+    """A render whose light has noise of this deviation."""
+    noise = np.random.default_rng(seed).normal(1, light, (*albedo.shape[:2], 1)).astype(np.float32)
+    return Render.from_arrays(rgb=albedo * noise, albedo=albedo, normal=np.full_like(albedo, 0.5))
+
+
+@pytest.mark.parametrize("light", [0.0, 0.5])
+@pytest.mark.parametrize(("samples", "clean"), [(1, False), (2, False), (16, True), (64, True)])
+def test_few_samples_show_at_the_edges_of_an_albedo(samples, clean, light):
+    hr = render_of(checks(samples), light)
+    assert has_clean_aovs(hr, align(hr, hr)) is clean
+    lr = Render.from_arrays(rgb=box_downsample(hr.layers["rgb"], 2))
+    assert has_clean_aovs(hr, align(lr, hr)) is clean
+
+
+def test_aovs_without_an_edge_and_renders_without_aovs_are_clean():
+    plain = render_of(np.full((SIZE, SIZE, 3), 0.5, np.float32), 0.5)
+    without = Render.from_arrays(rgb=checks(1))
+    assert has_clean_aovs(plain, align(plain, plain)) and has_clean_aovs(without, align(without, without))
+
+
+@pytest.mark.parametrize("samples", [2, 64])
+def test_only_best_takes_the_model_for_little_noise_if_aovs_are_noisy(samples):
+    """A room with even light has little noise at 2 spp, and the other model copies the noise of its AOVs."""
+    albedo = checks(samples)
+    albedo[:, SIZE // 3 :] = 0.5
+    hr = render_of(albedo, 0.02)
+    for family, clean in (("joint-large", True), ("joint", samples == 64)):
+        assert family_for_noise(family, hr, hr, align(hr, hr))[0] == family + "-clean" * clean

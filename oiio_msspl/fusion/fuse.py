@@ -23,9 +23,10 @@ from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
 from oiio_msspl.fusion.tiles.prepare import FramePair
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, memory_to_fuse, require_memory, strips_memory
 from oiio_msspl.image.arrays import Array, blank, unload
-from oiio_msspl.image.filters import even_and_odd
+from oiio_msspl.image.filters import columns_apart, even_and_odd
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.model.catalogue import shipped_models
+from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.session import Session
 
 
@@ -122,7 +123,8 @@ def fuse(
             session.release_memory()  # to check a large frame needs memory, too
         judgement = Judgement()
         if lr is hr:
-            frame.lrhs_luminance, frame.hrls_luminance = even_and_odd(averages.rgb)
+            halves = columns_apart if session.contract.denoiser.endswith(SPREAD) else even_and_odd
+            frame.lrhs_luminance, frame.hrls_luminance = halves(averages.rgb)
         else:
             frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb
             judgement = check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)

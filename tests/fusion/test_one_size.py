@@ -8,7 +8,7 @@ from oiio_msspl import InputError, Render, fuse, fuse_arrays
 from oiio_msspl.fusion.checks.pair import check_renders
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.image.filters import even_and_odd
+from oiio_msspl.image.filters import box_downsample, columns_apart, even_and_odd
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.encoding import encode_radiance
 from tests.conftest import noisy, picture, spread
@@ -85,6 +85,22 @@ def test_one_render_tells_whether_its_noise_is_spread(sigma):
     rgb = layers()["rgb"]
     render = Render.from_arrays("hr", rgb=spread(rgb, sigma) if sigma else rgb)
     assert is_noise_spread(render, render, align(render, render)) == bool(sigma)
+
+
+def test_columns_apart_are_two_pictures_whose_noise_is_independent_though_it_is_spread():
+    noise = np.random.default_rng(1).normal(size=(200, 243)).astype(np.float32)
+    wide = noise[:, :-2] + 4 * noise[:, 1:-1] + noise[:, 2:]
+    correlation = {}
+    for halves in (columns_apart, even_and_odd):
+        cells = [box_downsample(half[:, :240], 4) for half in halves(wide)]
+        correlation[halves] = np.corrcoef(*map(np.ravel, cells))[0, 1]
+    assert abs(correlation[columns_apart]) < 0.2 < 0.4 < correlation[even_and_odd]
+    ramp = np.broadcast_to(np.arange(11, dtype=np.float32)[:, None], (3, 11, 1))
+    first, second = columns_apart(ramp)
+    np.testing.assert_allclose(first[:, :9], ramp[:, :9])
+    np.testing.assert_allclose(second[:, 2:], ramp[:, 2:])
+    for width in (1, 2):  # has no second column
+        assert (columns_apart(ramp[:, :width])[1] == ramp[:, width - 1 : width]).all()
 
 
 def test_even_and_odd_pixels_are_two_pictures():

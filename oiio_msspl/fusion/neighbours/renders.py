@@ -24,6 +24,7 @@ from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RADIANCE_FEATURES
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.checks.averages import BRIGHTEST
 from oiio_msspl.fusion.checks.noise_level import has_clean_aovs
+from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
 from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
@@ -32,7 +33,7 @@ from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import RepairCounts, read_lrhs
 from oiio_msspl.image.arrays import Array, Mask, repair, unload
 from oiio_msspl.image.colour import luminance
-from oiio_msspl.image.filters import even_and_odd, grown, interpolate, means_around
+from oiio_msspl.image.filters import columns_apart, even_and_odd, grown, interpolate, means_around
 from oiio_msspl.image.sampling import nearest_indices, sample_cubic
 from oiio_msspl.model.contract import ONE_SIZE
 
@@ -81,7 +82,7 @@ class RenderPair:
         """Colours of the LRHS, and of the HRLS averaged over its pixels, (h, w, 3) each over the alignment's grid.
 
         Both show the same places: where an odd size was rounded, the LRHS is interpolated. Of one render, both are
-        those of its even and of its odd pixels. All are finite and >= 0.
+        its :meth:`halves`. All are finite and >= 0.
         """
         alignment = self.alignment
 
@@ -90,9 +91,17 @@ class RenderPair:
 
         high = np.concatenate(for_bands(alignment, band))
         if self.is_one_render:
-            return even_and_odd(high)
+            return self.halves(high)
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
         return _bounded(lrhs), high
+
+    def halves(self, colours: Array) -> tuple[Array, Array]:
+        """Return two pictures of the colours (h, w, 3) of one render whose noise is independent."""
+        return columns_apart(colours) if self._is_noise_spread else even_and_odd(colours)
+
+    @cached_property
+    def _is_noise_spread(self) -> bool:
+        return bool(is_noise_spread(self.hr, self.hr, self.alignment))
 
     @cached_property
     def has_clean_aovs(self) -> bool:
@@ -180,7 +189,7 @@ class RenderBand:
         hrls = to_grid(alignment, _bounded(colours) * valid[..., None], area)
         hrls = np.where(share[..., None] >= COVERED, hrls / np.maximum(share, 1e-6)[..., None], self._mean_colours)
         if self._low is None:
-            lrhs, hrls = even_and_odd(hrls)
+            lrhs, hrls = self._pair.halves(hrls)
         else:
             low, usable = self._fetch_low(neighbour, path, valid, share)
             usable &= _make_finite(low)

@@ -80,7 +80,7 @@ class Light(ABC):
         brightness = sum_3x3(picture) * np.float32(1 / 9) + np.float32(self.darkest)
         self._brightness = self.cells(brightness)
         bright = brightness if lrhs.shape[-1] == brightness.shape[-1] else luminance(brightness)[..., None]
-        self._noise = self.cells(_noise(lrhs, hrls, bright)) / np.float32(4**self._halvings)
+        self._noise = _noise(*(self.cells(image) for image in (lrhs, hrls, bright)))
         self.noise = float(np.median(self._noise)) * 4**self._halvings
         """Variance of the mean of both renders in an LRHS pixel, relative to the light: the median of all."""
         hrls_noise = 2 * self.noise * alignment.scale**2

@@ -164,6 +164,22 @@ def test_a_frame_without_noise_is_not_blurred_by_neighbours_that_moved():
     assert average_renders(pair, [still(pair)], [still(pair)]).frames.mean() > 2.9
 
 
+@pytest.mark.parametrize("spread", [False, True])
+def test_frames_of_one_render_count_though_a_filter_has_spread_their_noise(spread):
+    """Its halves tell how much light has changed, and a lamp that brightens is noticed."""
+    renders = []
+    for seed, light in enumerate((1, 1, 1, 1.5)):
+        noise = np.random.default_rng(seed).normal(0, 0.5, (HEIGHT + 2, WIDTH + 2, 1)).astype(np.float32)
+        if spread:
+            noise = noise[:-2] + 4 * noise[1:-1] + noise[2:]
+            noise = (noise[:, :-2] + 4 * noise[:, 1:-1] + noise[:, 2:]) / 18
+        noise = noise[:HEIGHT, :WIDTH]
+        render = Render.from_arrays("hr", rgb=(texture() * light * (1 + noise)).astype(np.float32))
+        renders.append(RenderPair(render, render))
+    assert average_renders(renders[0], [still(renders[1])], [still(renders[2])]).frames.mean() > 2.3
+    assert average_renders(renders[0], [still(renders[3])], []).frames.mean() < 1.2
+
+
 def test_neighbours_that_moved_by_half_a_pixel_give_each_pixel_another_sample():
     """Noise that two pixels share looks like detail to a network."""
     pairs = [pair_of(texture(shift), seed) for seed, shift in enumerate((0.0, 0.5))]

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
-from oiio_msspl.model.contract import SPREAD
+from oiio_msspl.model.contract import ONE_SIZE, SPREAD
 from research.benchmarks import detail, paper, passes, results, runtime
 from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label
 from research.benchmarks.one_size import SEEDS
@@ -244,12 +244,16 @@ def _oidn(row: Row) -> dict[str, Any]:
 
 
 def _averaged_oidn(row: Row) -> dict[str, Any]:
-    return {"method": OIDN_SPLIT_NEIGHBOURS if row["source"] == "shots_spread" else OIDN_NEIGHBOURS}
+    method = OIDN_SPLIT_NEIGHBOURS if row["source"] == "shots_spread" else OIDN_NEIGHBOURS
+    return {"method": method, "scale": max(int(row["scale"]), 2)}  # an LRHS tests the light of its frames
 
 
 def _shot_lines(source: str, title: str, scales: Sequence[int]) -> list[Line]:
     return [
-        Line([f"`--quality {q}`, x{scale}{title}"], {"source": source, "method": prefix + NEIGHBOURS, "scale": scale})
+        Line(
+            [f"`--quality {q}`, {'one render' if scale == ONE_SIZE else f'x{scale}'}{title}"],
+            {"source": source, "method": prefix + NEIGHBOURS, "scale": scale},
+        )
         for (q, prefix), scale in itertools.product(QUALITIES.items(), scales)
     ]
 
@@ -259,7 +263,7 @@ SHOTS = Table(
     ("sequence", "scale", "method"),
     ("frames averaged with neighbours",),
     [
-        *_shot_lines("shots", "", (2, 4)),
+        *_shot_lines("shots", "", (ONE_SIZE, 2, 4)),
         *_shot_lines("shots_without_vectors", ", without vectors", (2,))[1:],
         *_shot_lines("shots_spread", ", spread noise", (2,)),
     ],

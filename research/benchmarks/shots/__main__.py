@@ -25,33 +25,23 @@ import numpy as np
 
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions
-from oiio_msspl.model.catalogue import QUALITIES as MODELS
-from oiio_msspl.model.contract import SPREAD
 from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.shots.measures import flicker, psnr, relmse
-from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, QUALITIES, Made, all_methods
+from research.benchmarks.shots.methods import Made, all_methods
 from research.benchmarks.shots.sequence import Sequence, load, without_vectors
 
 KEYS = ("sequence", "scale", "method")
 
 
-def model_of(method: str, scale: int, *, spread: bool) -> Row:
-    """Return the column ``model`` of a method; nothing for OIDN."""
-    for quality, prefix in reversed(QUALITIES.items()):
-        if method in (prefix + ALONE, prefix + NEIGHBOURS):
-            return {"model": f"{MODELS[quality]}{SPREAD if spread else ''}-x{scale}"}
-    return {}
-
-
-def measure(sequence: Sequence, made: list[Made], *, spread: bool = False) -> Iterator[Row]:
+def measure(sequence: Sequence, made: list[Made]) -> Iterator[Row]:
     """Yield a row for each method."""
     truth = srgb(sequence.truth[0]), srgb(sequence.truth[1])
     for method in made:
         images = srgb(method.images)
         by_frame = [psnr(image, (first, second)) for image, first, second in zip(images, *truth, strict=True)]
         row: Row = {"sequence": sequence.name, "scale": method.scale, "method": method.method}
-        row |= model_of(method.method, method.scale, spread=spread)
+        row |= {"model": method.model} if method.model else {}
         row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
         row |= {"relmse": relmse(method.images, sequence.truth), "flicker": flicker(images, truth)}
         row |= {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
@@ -79,7 +69,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
             made = list(all_methods(judged, options, args.methods, spread=args.spread))
-        results.show(list(measure(sequence, made, spread=args.spread)), args.table, KEYS)
+        results.show(list(measure(sequence, made)), args.table, KEYS)
 
 
 if __name__ == "__main__":

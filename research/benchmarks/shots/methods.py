@@ -50,6 +50,8 @@ class Made:
     """Linear (frames, h, w, 3)."""
     motion: str = ""
     """Say how the motion is known; empty for single frames."""
+    model: str = ""
+    """Of ours."""
 
 
 def all_methods(
@@ -72,7 +74,8 @@ def all_methods(
         for scale in (ONE_SIZE, *SCALES):
             for name, run in _by_scale(sequence, scale, options, Path(folder), spread=spread):
                 if fnmatchcase(name, pattern):
-                    yield Made(name, scale, _images(run), _motion(run.plan) if run.plan.count else "")
+                    model = "" if isinstance(run, _RunOfPeer) else f"{run.settings.model}-x{scale}"
+                    yield Made(name, scale, _images(run), _motion(run.plan) if run.plan.count else "", model)
 
 
 class _RunOfPeer(ShotRun):

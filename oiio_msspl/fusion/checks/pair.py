@@ -17,11 +17,10 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.checks.averages import BLOCK, HrlsAverages, bounded_luminance
-from oiio_msspl.fusion.checks.colours import different_colours
+from oiio_msspl.fusion.checks.colours import different_colours, different_primaries
 from oiio_msspl.fusion.checks.edges import Aovs, judge_aovs
 from oiio_msspl.fusion.checks.framing import Framing, central_slices, find_framing, jackknife_error, parts
 from oiio_msspl.fusion.checks.likeness import ALIKE, VISIBLE, correlations, tone_mapped
-from oiio_msspl.fusion.checks.primaries import different_primaries
 from oiio_msspl.fusion.checks.same_noise import MIDDLE, compare_noise
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import bucket_side, read_lrhs, read_tile
@@ -139,7 +138,7 @@ def _judge(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> Judgem
     if scale == ONE_SIZE and min(low.shape) > 1:  # means over 2 x 2 pixels have less noise than renders of full size
         scale, places = 2, (_halved(low), _halved(high))
     find = in_background(lambda: find_framing(*places))
-    aovs = in_background(lambda: judge_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
+    aovs = in_background(lambda: judge_aovs(low, hrls))
     judgement = Judgement(_holes(rendered, (low, high), hrls))
     _judge_noise(judgement, low, hrls)
     framing = find()
@@ -265,12 +264,10 @@ def _judge_aovs(judgement: Judgement, aovs: Aovs, hrls: HrlsAverages) -> None:
             "(--map normal=LAYER says which layer they are)"
         )
         judgement.warnings.append(Finding("negated_normal", text))
-    elif agree is None and hrls.normal_edges is not None:
+    elif agree is None and NORMAL in hrls.aovs:
         judgement.not_judged.append(_not_judged("which way the normals point"))
-    has = {ALBEDO: hrls.albedo is not None, NORMAL: hrls.normal_edges is not None}
-    judgement.not_judged += [
-        _not_judged(f"the {aov}") for aov, there in has.items() if there and aov not in aovs.judged
-    ]
+    unclear = (aov for aov in (ALBEDO, NORMAL) if aov in hrls.aovs and aov not in aovs.judged)
+    judgement.not_judged += [_not_judged(f"the {aov}") for aov in unclear]
 
 
 def _judge_framing(judgement: Judgement, framing: Framing, alignment: Alignment, scale: int) -> None:

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, RGB
-from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.alpha import fuse_alpha
+from oiio_msspl.fusion.tiles.features import in_hrls_pixels
 from oiio_msspl.fusion.tiles.guards import LAYER_REACH, black_in_both, check_finite, repeated
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile
 from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
@@ -53,9 +54,8 @@ class FusedPixels:
         """Return ``trust`` at the resolution of the HRLS, (height, width, 1); 0 without it."""
         if self.trust is None:
             return np.zeros_like(self.rgb[..., :1], np.float32)
-        scale, grid, data = self.alignment.scale, self.alignment.grid, self.alignment.hr_data_window
-        whole = enlarged(self.trust[..., None], scale)
-        return whole[data.slices(Window(grid.x0 * scale, grid.y0 * scale, grid.x1 * scale, grid.y1 * scale))]
+        scale, grid = self.alignment.scale, in_hrls_pixels(self.alignment.grid, self.alignment.scale)
+        return enlarged(self.trust[..., None], scale)[self.alignment.hr_data_window.slices(grid)]
 
 
 @dataclass(frozen=True)
@@ -142,9 +142,8 @@ def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shar
     if borrowed is not None:  # there, the renders are not independent
         trust[borrowed] = 0
         picture = np.where(repeated(borrowed[..., None], renders.scale), fused, picture)
-    (rows, columns), area = tile.features.core, tile.features.lrhs_area
-    core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
-    result.trust[core.slices(result.alignment.grid)] = trust[rows, columns]
+    core, area = tile.features.core, tile.features.lrhs_area
+    result.trust[core.slices(result.alignment.grid)] = trust[core.slices(area)]
     return picture
 
 

@@ -158,8 +158,7 @@ def bucket_side(scale: int) -> int:
 
 def _is_dead(rgb: Array) -> Mask:
     """Return the pixels (h, w) without green whose red and blue are equal: black, or magenta as of missing shaders."""
-    dead: Mask = (rgb[..., 1] == 0) & (rgb[..., 0] == rgb[..., 2])
-    return dead
+    return np.logical_and(rgb[..., 1] == 0, rgb[..., 0] == rgb[..., 2])
 
 
 def _infinite(rgb: Array) -> Mask:

@@ -91,7 +91,9 @@ class HrlsAverages:
             self.aovs[ALBEDO][target] = luminance(box_downsample(_hrls_pixels(pair, ALBEDO, window), pair.scale))
         if NORMAL in pair.hrls:
             pixels = _hrls_pixels(pair, NORMAL, window)
-            self.aovs[NOISE][target] = _noise_of_edges(pixels, pair.scale)
+            # Means over scale x scale pixels, in two differences of two of them each.
+            variance = reduce(np.add, planes_of(_noise_variance(pixels, pair.scale)))
+            self.aovs[NOISE][target] = np.sqrt(variance) * np.float32(2 / pair.scale)
             mean = box_downsample(pixels, pair.scale)
             self.aovs[NORMAL][target] = _edge_lengths(mean)
             if NORMAL in pair.lrhs and pair.lrhs is not pair.hrls:
@@ -144,14 +146,6 @@ def _edge_lengths(normal: Array) -> Array:
         squares[:-1] += np.square(np.diff(plane, axis=0))
         squares[:, :-1] += np.square(np.diff(plane, axis=1))
     return np.sqrt(squares)
-
-
-def _noise_of_edges(pixels: Array, scale: int) -> Array:
-    """Return :func:`_edge_lengths` of constant normals with the noise of the HRLS's (s*h, s*w, 3), RMS, (h, w)."""
-    variance = reduce(np.add, planes_of(_noise_variance(pixels, scale)))
-    # Means over scale x scale pixels, in two differences of two of them each.
-    noise: Array = np.sqrt(variance) * np.float32(2 / scale)
-    return noise
 
 
 def _noise_variance(pixels: Array, scale: int) -> Array:

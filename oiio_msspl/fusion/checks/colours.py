@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.image.arrays import Mask
-from oiio_msspl.image.colour import ACES2065, ACESCG, P3, REC709, conversion, srgb
+from oiio_msspl.image.colour import ACES2065, ACESCG, P3, REC709, conversion
 
 #: Another reading of the colours counts if it leaves at most this fraction of the difference of chromaticity, and is
 #: better by this many standard errors.
@@ -53,8 +53,8 @@ def _readings(low: Colours, high: Colours) -> Iterator[tuple[str, Colours, Colou
     for (a, first), (b, second) in itertools.permutations(_SPACES.items(), 2):
         matrix = conversion(first, second)
         yield f"the LRHS looks like {a} and the HRLS like {b}", matrix @ low, np.linalg.inv(matrix) @ high
-    yield "the LRHS looks encoded for a display (sRGB) and the HRLS linear", _from_srgb(low), srgb(high)
-    yield "the HRLS looks encoded for a display (sRGB) and the LRHS linear", srgb(low), _from_srgb(high)
+    yield "the LRHS looks encoded for a display (sRGB) and the HRLS linear", _from_srgb(low), _srgb(high)
+    yield "the HRLS looks encoded for a display (sRGB) and the LRHS linear", _srgb(low), _from_srgb(high)
     gains = (high.sum(axis=1) / low.sum(axis=1))[:, None]
     gains /= np.exp(np.log(gains).mean())
     if np.abs(np.log(gains)).max() < LEAST:
@@ -69,12 +69,11 @@ def different_colours(low: Colours, high: Colours) -> str | None:
     Every reading is tried on the LRHS, and its inverse on the HRLS, and the worse of the two counts: a matrix that
     makes colours paler also makes their noise paler, but then its inverse does the opposite.
 
-    Args:
-        low, high: RGB of the same blocks of both renders, (n, 3).
+    ``low``, ``high``: RGB of the same blocks of both renders, (n, 3).
     """
     finite = np.isfinite(low + high).all(axis=1)  # sums of radiance near the limit of float32 are not
     low, high = low[finite], high[finite]
-    lit = _lit(low, high) if finite.any() else finite[finite]
+    lit = _lit(low, high) if low.size else np.zeros(0, np.bool_)
     if np.count_nonzero(lit) < MIN_BLOCKS:
         return None
     low, high = low.T[:, lit], high.T[:, lit]  # each channel is contiguous
@@ -96,6 +95,11 @@ def different_colours(low: Colours, high: Colours) -> str | None:
     return best
 
 
+def _srgb(linear: Colours) -> Colours:
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
+
+
 def _from_srgb(encoded: Colours) -> Colours:
     x = np.maximum(encoded, 0)
     return np.where(x <= 0.04045, x / 12.92, np.power((x + 0.055) / 1.055, 2.4))
@@ -110,8 +114,7 @@ def _differences(a: Colours, b: Colours) -> NDArray[np.float64]:
 def different_primaries(low: Colours, high: Colours) -> str | None:
     """Return in words how the primaries of two renders differ; None if they agree, or are too few to judge.
 
-    Args:
-        low, high: RGB of the same blocks of LRHS and HRLS, (rows, columns, 3).
+    ``low``, ``high``: RGB of the same blocks of LRHS and HRLS, (rows, columns, 3).
     """
     low, high = (np.where(np.isfinite(colours), colours, 0) for colours in (low, high))
     lit = _lit(low, high)

@@ -121,16 +121,15 @@ def by_shift(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> t
         shape: of the pictures.
     """
     furthest = min(CONTROL[1], min(shape) // 2 - 1)
-    window = np.roll(np.fft.irfft2(spectrum, shape), (furthest, furthest), (0, 1))
-    window = window[: 2 * furthest + 1, : 2 * furthest + 1]
+    rolled: Array = np.roll(np.fft.irfft2(spectrum, shape), (furthest, furthest), (0, 1))
+    window = rolled[: 2 * furthest + 1, : 2 * furthest + 1]
     y, x = np.abs(np.mgrid[-furthest : furthest + 1, -furthest : furthest + 1])
     return window, window[np.maximum(x, y) >= CONTROL[0]]
 
 
 def _normalised(values: Array, side: int) -> Array:
     """Return the fine structure of pixels of a size, with a mean of 0 and a sum of squares of 1."""
-    height, width = (n // side * side for n in values.shape)
-    fine = fine_structure(box_downsample(values[:height, :width], side) if side > 1 else values)
+    fine = fine_structure(box_downsample(values, side) if side > 1 else values)
     fine = fine - fine.mean()
     return fine / np.float32(max(float(np.linalg.norm(fine)), 1e-20))
 

@@ -136,7 +136,7 @@ def _judge(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> Judgem
     low = np.where(lost_low, high, low)
     scale, places = hrls.alignment.scale, (low, high)
     if scale == ONE_SIZE and min(low.shape) > 1:  # means over 2 x 2 pixels have less noise than renders of full size
-        scale, places = 2, (_halved(low), _halved(high))
+        scale, places = 2, (box_downsample(low, 2), box_downsample(high, 2))
     find = in_background(lambda: find_framing(*places))
     aovs = in_background(lambda: judge_aovs(low, hrls))
     judgement = Judgement(_holes(rendered, (low, high), hrls))
@@ -163,12 +163,6 @@ def _judge(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> Judgem
         )
         judgement.warnings.append(Finding("different_place", text))
     return judgement
-
-
-def _halved(image: Array) -> Array:
-    """Return the means of 2 x 2 pixels, without an odd row or column."""
-    height, width = (side // 2 * 2 for side in image.shape)
-    return box_downsample(image[:height, :width], 2)
 
 
 def _black_beauty(name: str, lit_name: str) -> InputError:
@@ -208,7 +202,7 @@ def _judge_noise(judgement: Judgement, low: Array, hrls: HrlsAverages) -> None:
     noisy, equal = hrls.blocks[..., 6:].sum(axis=(0, 1))
     middle, quarters = low[central_slices(low.shape, MIDDLE)], hrls.quarters
     if hrls.alignment.scale == ONE_SIZE and min(middle.shape) > 1:
-        middle, quarters = _halved(middle), quarters[: len(quarters) // 2 * 2, : quarters.shape[1] // 2 * 2]
+        middle, quarters = box_downsample(middle, 2), quarters[: len(quarters) // 2 * 2, : quarters.shape[1] // 2 * 2]
     same, judgement.independent = compare_noise(middle, quarters)
     if same or (noisy >= MIN_NOISY_PIXELS and equal > EQUAL_PIXELS * noisy):
         text = (
@@ -221,11 +215,7 @@ def _judge_noise(judgement: Judgement, low: Array, hrls: HrlsAverages) -> None:
 
 
 def _looks_alike(judgement: Judgement, low: Array, high: Array, framing: Framing) -> bool:
-    """Judge the brightness of blocks. Return False if it is no use to judge more.
-
-    Raises:
-        InputError: the two have nothing in common.
-    """
+    """Judge the brightness of blocks, and raise InputError if nothing is common. Return False if more is no use."""
     if framing.mirrored is not None:
         text = f"one of the two renders is mirrored {framing.mirrored}: write both in the same orientation"
         judgement.warnings.append(Finding("mirrored", text))
@@ -250,13 +240,9 @@ def _judge_aovs(judgement: Judgement, aovs: Aovs, hrls: HrlsAverages) -> None:
             f"frame, with the same crop and overscan? (--map {aov}=LAYER says which)"
         )
         judgement.warnings.append(Finding("shifted_aov", text))
-    judgement.warnings += [
-        Finding(
-            "foreign_aov",
-            f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)",
-        )
-        for aov in aovs.foreign
-    ]
+    for aov in aovs.foreign:
+        text = f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)"
+        judgement.warnings.append(Finding("foreign_aov", text))
     agree = hrls.normals_agree
     if agree is not None and agree < NEGATED:
         text = (

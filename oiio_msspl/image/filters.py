@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from functools import reduce
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,18 @@ from numpy.typing import NDArray
 from oiio_msspl.image.arrays import FLOAT_MAX, Array, Mask, planes_of
 from oiio_msspl.image.parallel import for_row_blocks
 
+T = TypeVar("T", bound=np.generic)
+
 
 def box_downsample(image: NDArray[Any], scale: int) -> Array:
     """Return the mean of ``scale`` x ``scale`` pixels, half or float: (H, W, ...) to (H/s, W/s, ...).
 
-    The means are finite if the pixels are. They have the memory layout of ``image``.
+    Rows and columns that are left over do not count. The means are finite if the pixels are. They have the memory
+    layout of ``image``.
     """
-    height, width, *channels = image.shape
-    result = np.empty_like(image, np.float32, subok=False, shape=(height // scale, width // scale, *channels))
+    height, width = (side // scale for side in image.shape[:2])
+    image = image[: height * scale, : width * scale]
+    result = np.empty_like(image, np.float32, subok=False, shape=(height, width, *image.shape[2:]))
 
     def work(rows: slice) -> None:
         # Sums of strided views are ten times as fast as np.mean over short axes. Sums of half floats would be rounded.
@@ -32,7 +36,7 @@ def box_downsample(image: NDArray[Any], scale: int) -> Array:
         np.clip(sums, -FLOAT_MAX, FLOAT_MAX, out=sums)
         np.multiply(sums, np.float32(1 / scale**2), out=result[rows.start // scale : rows.stop // scale])
 
-    for_row_blocks(work, height, image[:1].size, multiple=scale)
+    for_row_blocks(work, len(image), image[:1].size, multiple=scale)
     return result
 
 
@@ -122,30 +126,22 @@ def _interleave(before: Array, here: Array, after: Array, phases: Sequence[Array
         lines[:] = here + np.float32(abs(position)) * (nearest - here)
 
 
-def neighbours(values: NDArray[Any], distance: int = 1) -> Iterator[NDArray[Any]]:
-    """Yield the 3 x 3 pixels around each pixel, ``distance`` apart, as nine shifted images (h, w, ...).
-
-    The edge pixel is repeated.
-    """
+def neighbours(values: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Yield the 3 x 3 pixels around each pixel as nine shifted images (h, w, ...). The edge pixel is repeated."""
     height, width = values.shape[:2]
-    margins = [(distance, distance) if axis < 2 else (0, 0) for axis in range(values.ndim)]
-    padded = np.pad(values, margins, mode="edge")
-    for y, x in itertools.product(range(0, 3 * distance, distance), repeat=2):
+    padded = np.pad(values, [(1, 1), (1, 1), *[(0, 0)] * (values.ndim - 2)], mode="edge")
+    for y, x in itertools.product(range(3), repeat=2):
         yield padded[y : y + height, x : x + width]
 
 
 def all_within(mask: Mask, reach: int) -> Mask:
     """Return where a mask (h, w, ...) is true for all pixels up to ``reach`` rows and columns away (erosion)."""
-    distance = 1
-    while reach > 0:
-        mask = reduce(np.logical_and, neighbours(mask, min(distance, reach)))
-        reach, distance = reach - distance, 2 * distance
-    return mask
+    return ~max_around(~mask, reach)
 
 
 def grown(mask: Mask, reach: int = 1) -> Mask:
     """Return a mask (h, w, ...) that is extended by ``reach`` rows and columns on all sides (dilation)."""
-    return ~all_within(~mask, reach)
+    return max_around(mask, reach)
 
 
 def in_squares(whole: Mask, partly: Mask, side: int, fraction: float) -> Mask:
@@ -169,7 +165,7 @@ def max_3x3(values: Array) -> Array:
     return max_around(values, 1)
 
 
-def max_around(values: Array, reach: int) -> Array:
+def max_around(values: NDArray[T], reach: int) -> NDArray[T]:
     """Return the largest value up to ``reach`` rows and columns away from each pixel, (h, w, ...)."""
     for axis in (0, 1):
         distance, left = 1, reach

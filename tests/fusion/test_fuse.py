@@ -9,8 +9,8 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.tiles import tiling
-from oiio_msspl.fusion.tiles.alpha import INVISIBLE
 from oiio_msspl.fusion.tiles.guards import SMEAR
+from oiio_msspl.fusion.tiles.network import INVISIBLE
 from oiio_msspl.image.filters import grown
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from oiio_msspl.model.session import Session

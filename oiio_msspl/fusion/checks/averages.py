@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import defaultdict
 from functools import reduce
 from typing import Any
 
@@ -28,6 +29,8 @@ BRIGHTEST = np.float32(1e15)
 BLOCK = 4
 #: A pixel has noise if its RMS is this fraction of its brightness.
 NOISY = 0.05
+#: Name of the noise in :attr:`HrlsAverages.aovs`.
+NOISE = "noise"
 
 
 class HrlsAverages:
@@ -35,9 +38,9 @@ class HrlsAverages:
 
     Attributes:
         rgb: luminance (h, w) over the grid of the alignment.
-        albedo: luminance over the central area of the grid, where edges are compared; None if the HRLS has none.
-        normal_edges: length of the difference of the normals to the next pixels, over the same area, or None.
-        normal_noise: root mean square of that difference if the normals were constant, by their noise, or None.
+        aovs: those that the HRLS has, over the central area of the grid, where edges are compared. Luminance of the
+            albedo; length of the difference of the normals to the next pixels; and as ``NOISE``, the root mean square
+            of that difference if the normals were constant, by their noise.
         quarters: luminance of quarters of LRHS pixels over the middle of the grid, see
             :mod:`oiio_msspl.fusion.checks.same_noise`; of whole pixels if both renders have one size.
         failed: LRHS pixels (h, w) in buckets that failed, of the LRHS and of the HRLS.
@@ -55,9 +58,8 @@ class HrlsAverages:
             Window(columns.start, rows.start, columns.stop, rows.stop).shift(grid.x0, grid.y0)
             for rows, columns in (central_slices(self.rgb.shape, side) for side in (AREA, MIDDLE))
         )
-        self.albedo: Array | None = None
-        self.normal_edges: Array | None = None
-        self.normal_noise: Array | None = None
+        size = self._centre.height, self._centre.width
+        self.aovs = defaultdict[str, Array](lambda: np.zeros(size, np.float32))
         self._cosines = np.zeros(2)  # sums of products of the normals, and of their lengths
         self._parts = 1 if alignment.scale == ONE_SIZE else 2
         self.quarters = np.zeros((self._parts * self._middle.height, self._parts * self._middle.width), np.float32)
@@ -68,13 +70,11 @@ class HrlsAverages:
     def add(self, pair: TileFeatures) -> None:
         """Add the core of a tile."""
         self.is_lost &= pair.hrls_is_lost
-        rows, columns = pair.core
-        area, grid = pair.lrhs_area, self.alignment.grid
-        core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
-        place = core.shift(-grid.x0, -grid.y0)
-        self._add_beauty(pair.lrhs[RGB][pair.core], _hrls_pixels(pair, RGB, core), place)
+        core, grid = pair.core, self.alignment.grid
+        inside = core.slices(pair.lrhs_area)
+        self._add_beauty(pair.lrhs[RGB][inside], _hrls_pixels(pair, RGB, core), core.shift(-grid.x0, -grid.y0))
         for failed, new in zip(self.failed, pair.failed or (), strict=False):
-            failed[place.slices(Window(0, 0, grid.width, grid.height))] = new[pair.core]
+            failed[core.slices(grid)] = new[inside]
         middle = core.intersect(self._middle)
         if middle.width and middle.height:
             pixels = np.minimum(_hrls_pixels(pair, RGB, middle), BRIGHTEST)
@@ -85,19 +85,17 @@ class HrlsAverages:
             self._add_aovs(pair, centre)
 
     def _add_aovs(self, pair: TileFeatures, window: Window) -> None:
-        """Fill ``albedo`` and ``normal_edges`` over a part of the central area."""
-        target, size = window.slices(self._centre), (self._centre.height, self._centre.width)
+        """Fill ``aovs`` over a part of the central area."""
+        target = window.slices(self._centre)
         if ALBEDO in pair.hrls:
-            if self.albedo is None:
-                self.albedo = np.zeros(size, np.float32)
-            self.albedo[target] = luminance(box_downsample(_hrls_pixels(pair, ALBEDO, window), pair.scale))
+            self.aovs[ALBEDO][target] = luminance(box_downsample(_hrls_pixels(pair, ALBEDO, window), pair.scale))
         if NORMAL in pair.hrls:
-            if self.normal_edges is None or self.normal_noise is None:
-                self.normal_edges, self.normal_noise = np.zeros(size, np.float32), np.zeros(size, np.float32)
             pixels = _hrls_pixels(pair, NORMAL, window)
-            self.normal_noise[target] = _noise_of_edges(pixels, pair.scale)
+            # Means over scale x scale pixels, in two differences of two of them each.
+            variance = reduce(np.add, planes_of(_noise_variance(pixels, pair.scale)))
+            self.aovs[NOISE][target] = np.sqrt(variance) * np.float32(2 / pair.scale)
             mean = box_downsample(pixels, pair.scale)
-            self.normal_edges[target] = _edge_lengths(mean)
+            self.aovs[NORMAL][target] = _edge_lengths(mean)
             if NORMAL in pair.lrhs and pair.lrhs is not pair.hrls:
                 low = pair.lrhs[NORMAL][window.slices(pair.lrhs_area)]
                 lengths = np.linalg.norm(low, axis=-1) * np.linalg.norm(mean, axis=-1)
@@ -142,20 +140,12 @@ class HrlsAverages:
 
 
 def _edge_lengths(normal: Array) -> Array:
-    """Return the length of the difference of normals (h, w, 3) to the next pixels, to the right and down, (h, w)."""
+    """Return the length (h, w) of the difference of normals (h, w, 3) to the next pixels, to the right and down."""
     squares = np.zeros(normal.shape[:2], np.float32)
     for plane in planes_of(normal):
         squares[:-1] += np.square(np.diff(plane, axis=0))
         squares[:, :-1] += np.square(np.diff(plane, axis=1))
     return np.sqrt(squares)
-
-
-def _noise_of_edges(pixels: Array, scale: int) -> Array:
-    """Return :func:`_edge_lengths` of constant normals with the noise of the HRLS's (s*h, s*w, 3), RMS, (h, w)."""
-    variance = reduce(np.add, planes_of(_noise_variance(pixels, scale)))
-    # Means over scale x scale pixels, in two differences of two of them each.
-    noise: Array = np.sqrt(variance) * np.float32(2 / scale)
-    return noise
 
 
 def _noise_variance(pixels: Array, scale: int) -> Array:

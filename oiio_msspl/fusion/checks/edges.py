@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.fusion.checks.averages import NOISE, HrlsAverages
 from oiio_msspl.fusion.checks.framing import SMALLEST, central_area
+from oiio_msspl.fusion.checks.likeness import CONTROL, by_shift, fine_structure
 from oiio_msspl.image.arrays import Array, quantile
 from oiio_msspl.image.filters import blurred
 
-#: Smallest and largest shift of the control, in LRHS pixels. With smaller shifts, edges still overlap.
-CONTROL = (4, 16)
 #: Edges belong together if they fit by this many standard deviations better than the control. The albedo is compared in
 #: two ways, and the better one counts, so chance reaches further.
 FITS = {ALBEDO: 3.5, NORMAL: 1.5}
@@ -37,9 +37,11 @@ MIN_EDGES = 200
 #: Normals are noise if, at this fraction of their edges, noise makes up this fraction of the difference: under motion
 #: blur, each sample shows another moment. Without motion blur, renders at 1 spp of six scenes reach 0.45 in the one
 #: that is all fine grooves, and 0.14 in the others.
-NOISE = 0.5
+MOSTLY_NOISE = 0.5
 #: A difference of log albedo, or the length of a difference of normals, counts as an edge from here.
 EDGE = 0.2
+#: Where no shift lies among all, see :func:`oiio_msspl.fusion.checks.likeness.by_shift`.
+IN_PLACE = (CONTROL[1], CONTROL[1])
 
 
 @dataclass
@@ -54,24 +56,17 @@ class Aovs:
     """Those that lie elsewhere than the picture, and how far to the right and down, in LRHS pixels."""
 
 
-def judge_aovs(
-    low: Array, high: Array, albedo: Array | None, normal_edges: Array | None, normal_noise: Array | None
-) -> Aovs:
-    """Check whether albedo and normal are of the frame that the picture shows.
-
-    Args:
-        low, high: luminance (h, w) of LRHS and HRLS.
-        albedo, normal_edges, normal_noise: see :class:`oiio_msspl.fusion.checks.averages.HrlsAverages`.
-    """
-    low, high = central_area(low), central_area(high)
+def judge_aovs(low: Array, hrls: HrlsAverages) -> Aovs:
+    """Check whether albedo and normal are of the frame that the picture shows, given the LRHS's luminance (h, w)."""
+    low, high = central_area(low), central_area(hrls.rgb)
     if min(low.shape) < SMALLEST:
         return Aovs()
     lengths = {}
-    if albedo is not None:
-        surface = np.clip(albedo, 0, 1)
-        lengths[ALBEDO] = np.minimum(_length(_log_differences(surface, 0.05)), 1)
-    if normal_edges is not None:
-        lengths[NORMAL] = np.minimum(normal_edges, 0.5)
+    if ALBEDO in hrls.aovs:
+        of_albedo = _log_differences(np.clip(hrls.aovs[ALBEDO], 0, 1), 0.05)
+        lengths[ALBEDO] = _length(of_albedo)
+    if NORMAL in hrls.aovs:
+        lengths[NORMAL] = np.minimum(hrls.aovs[NORMAL], 0.5)
     edges = {name: _Edges.of(v) for name, v in lengths.items() if np.count_nonzero(v > EDGE) >= MIN_EDGES}
     if not edges:
         return Aovs()
@@ -79,18 +74,17 @@ def judge_aovs(
     lit = total[total > 0]
     floor = 0.1 * quantile(lit, 0.5) if lit.size else 1.0
     differences = _log_differences(total, floor)
-    picture = _Edges.of(np.minimum(_length(differences), 1))
+    picture = _Edges.of(_length(differences))
     shifted = {name: shift for name, v in edges.items() if (shift := picture.shift_of(v)) is not None}
     fits = {name: v.fit(picture) for name, v in edges.items()}
     doubtful = [name for name, fit in fits.items() if fit < FITS[name] and name not in shifted]
     # Differences have a sign, too: a brighter albedo is brighter in the picture. A light may turn that around.
-    if ALBEDO in doubtful and abs(_fit_signed(_log_differences(surface, 0.05), differences)) >= FITS[ALBEDO]:
+    if ALBEDO in doubtful and abs(_fit_signed(of_albedo, differences)) >= FITS[ALBEDO]:
         doubtful.remove(ALBEDO)
     doubtful = [name for name in doubtful if not edges[name].repeat_in(picture)]
     foreign = _foreign(doubtful, edges, fits, [_log_differences(v, floor / 2) for v in (low, high)])
-    if NORMAL in foreign and normal_edges is not None and normal_noise is not None:
-        # Normals that are noise can't be judged. That does not change how the albedo is judged.
-        foreign = [name for name in foreign if name != NORMAL or not _are_noise(normal_edges, normal_noise)]
+    if NORMAL in foreign and _are_noise(hrls.aovs[NORMAL], hrls.aovs[NOISE]):
+        foreign.remove(NORMAL)  # normals that are noise can't be judged; that does not change how the albedo is judged
     return Aovs([name for name in edges if name not in doubtful or name in foreign], foreign, shifted)
 
 
@@ -102,7 +96,7 @@ def _foreign(
         return []
     # If shapes are seen, so are colours. Even light shows colours without shapes.
     if doubtful != [ALBEDO] or fits.get(NORMAL, 0) < SAME_FRAME:
-        first, second = (_Edges.of(np.minimum(_length(differences), 1)) for differences in renders)
+        first, second = (_Edges.of(_length(differences)) for differences in renders)
         if first.fit(second) < VISIBLE:
             return []
     if len(edges) == 2 and len(doubtful) == 1 and edges[ALBEDO].fit(edges[NORMAL]) > SAME_FRAME:
@@ -112,8 +106,8 @@ def _foreign(
 
 def _are_noise(edges: Array, noise: Array) -> bool:
     """Return whether most edges (h, w) come from noise."""
-    noisy = blurred(np.square(noise), 4) > NOISE * blurred(np.square(edges), 4)
-    return bool(np.mean(noisy[edges > EDGE]) > NOISE)
+    noisy = blurred(np.square(noise), 4) > MOSTLY_NOISE * blurred(np.square(edges), 4)
+    return bool(np.mean(noisy[edges > EDGE]) > MOSTLY_NOISE)
 
 
 def _log_differences(values: Array, floor: float) -> list[Array]:
@@ -123,8 +117,9 @@ def _log_differences(values: Array, floor: float) -> list[Array]:
 
 
 def _length(differences: list[Array]) -> Array:
-    length: Array = np.sqrt(np.square(differences[0]) + np.square(differences[1]))  # a fraction of the time of np.hypot
-    return length
+    """Return the length (h, w) of differences, at most 1."""
+    # This takes a fraction of the time of np.hypot.
+    return np.minimum(np.sqrt(np.square(differences[0]) + np.square(differences[1])), 1)
 
 
 @dataclass(frozen=True)
@@ -136,25 +131,19 @@ class _Edges:
 
     @classmethod
     def of(cls, values: Array) -> _Edges:
-        """Keep values that differ from their neighbourhood, in units of its RMS, so that no bright corner dominates."""
-        fine = values - blurred(values, 4)
-        power = blurred(np.square(fine), 12)
-        contrast = fine / np.sqrt(power + np.float32(1e-3 * float(np.mean(np.square(fine))) + 1e-20))
-        return cls(np.fft.rfft2(contrast), values.shape)
+        return cls(np.fft.rfft2(fine_structure(values)), values.shape)
 
     def fit(self, picture: _Edges) -> float:
         """Return by how many standard deviations two pictures fit better than with a shift."""
-        return _above_control(np.conj(self.spectrum) * picture.spectrum, self.shape)
+        return float(_above_control(np.conj(self.spectrum) * picture.spectrum, self.shape)[IN_PLACE])
 
     def shift_of(self, aov: _Edges) -> tuple[int, int] | None:
         """Return the shift (x, y) with which an AOV's edges fit these clearly better, or None."""
-        window = _correlation(np.conj(self.spectrum) * aov.spectrum, self.shape)
-        fits = (window - _control(window).mean()) / max(float(_control(window).std()), 1e-30)
+        fits = _above_control(np.conj(self.spectrum) * aov.spectrum, self.shape)
         row, column = np.unravel_index(fits.argmax(), fits.shape)
-        furthest = CONTROL[1]
-        if fits.max() < SHIFTED or fits.max() - fits[furthest, furthest] < BY:
+        if fits.max() < SHIFTED or fits.max() - fits[IN_PLACE] < BY:
             return None
-        return int(column) - furthest, int(row) - furthest
+        return int(column) - IN_PLACE[1], int(row) - IN_PLACE[0]
 
     def repeat_in(self, picture: _Edges) -> bool:
         """Return whether ``picture`` has a pattern of these edges that repeats, as boards or tiles do.
@@ -163,7 +152,7 @@ class _Edges:
         shift as the correlation of the pattern with itself.
         """
         auto, cross = (
-            _correlation(np.conj(self.spectrum) * edges.spectrum, self.shape).ravel() for edges in (self, picture)
+            by_shift(np.conj(self.spectrum) * edges.spectrum, self.shape)[0].ravel() for edges in (self, picture)
         )
         auto, cross = auto - auto.mean(), cross - cross.mean()
         # Written so that a picture without edges, whose correlations are all 0, does not match.
@@ -174,25 +163,10 @@ def _fit_signed(a: list[Array], b: list[Array]) -> float:
     """Return how well signed differences of two pictures fit, in the units of :meth:`_Edges.fit`."""
     first, second = ([np.fft.rfft2(np.clip(values, -1, 1)) for values in differences] for differences in (a, b))
     products = [np.conj(u) * v for u, v in zip(first, second, strict=True)]
-    return _above_control(products[0] + products[1], a[0].shape)
+    return float(_above_control(products[0] + products[1], a[0].shape)[IN_PLACE])
 
 
-def _correlation(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> Array:
-    """Return the correlation of two pictures for shifts up to the furthest of ``CONTROL``, no shift in the middle."""
-    furthest = CONTROL[1]
-    correlation: Array = np.roll(np.fft.irfft2(spectrum, shape), (furthest, furthest), (0, 1))
-    return correlation[: 2 * furthest + 1, : 2 * furthest + 1]
-
-
-def _control(window: Array) -> Array:
-    """Return the correlations at the shifts of the control."""
-    furthest = CONTROL[1]
-    y, x = np.abs(np.mgrid[-furthest : furthest + 1, -furthest : furthest + 1])
-    control: Array = window[np.maximum(x, y) >= CONTROL[0]]
-    return control
-
-
-def _above_control(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> float:
-    window = _correlation(spectrum, shape)
-    control = _control(window)
-    return float((window[CONTROL[1], CONTROL[1]] - control.mean()) / max(float(control.std()), 1e-30))
+def _above_control(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> Array:
+    """Return by how many standard deviations of the control two pictures fit better than it, for each shift."""
+    window, control = by_shift(spectrum, shape)
+    return np.asarray((window - control.mean()) / max(float(control.std()), 1e-30))

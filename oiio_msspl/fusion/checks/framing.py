@@ -83,8 +83,7 @@ def _starts(low: Array, high: Array, fits: list[Fit]) -> list[NDArray[np.float64
     """Return estimates to start from: none, the shifts that fit best, and an estimate at a quarter of the size."""
     starts = [np.zeros(3), *(np.array([*fit.best, 0.0]) for fit in fits if fit.best_fit >= BETTER)]
     if min(low.shape) >= SMALLEST_COARSE:
-        height, width = (n // 4 * 4 for n in low.shape)
-        low_4, high_4 = (blurred(box_downsample(v[:height, :width], 4), 2) for v in (low, high))
+        low_4, high_4 = (blurred(box_downsample(v, 4), 2) for v in (low, high))
         starts.append(np.clip(_fit(low_4, high_4, np.zeros(3)).estimate * 4, -12, 12))
     # Starts less than half a pixel from each other lead to the same result.
     chosen: list[NDArray[np.float64]] = starts[:1]

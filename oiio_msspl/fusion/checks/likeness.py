@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.image.arrays import Array, quantile
 from oiio_msspl.image.filters import blurred, box_downsample
@@ -82,7 +83,7 @@ class Fit:
 def fine_fits(low: Array, high: Array) -> list[Fit]:
     """Return how well the fine structure of two pictures (h, w) fits, at all sizes of pixels that leave enough."""
     sides = [side for side in SIDES if min(low.shape) // side >= FEWEST]
-    return [_fit(_fine(low, side), _fine(high, side), side) for side in sides]
+    return [_fit(_normalised(low, side), _normalised(high, side), side) for side in sides]
 
 
 def mirrored(fits: list[Fit]) -> str | None:
@@ -105,23 +106,37 @@ def fits_better(before: list[Fit], after: list[Fit], *, certain: bool) -> bool:
     return any(new.here >= BETTER and gain >= BETTER / 2 for new, gain in zip(after, gains, strict=True))
 
 
-def _fine(values: Array, side: int) -> Array:
-    """Return differences to the neighbourhood, in units of its RMS, so that no bright corner dominates."""
-    height, width = (n // side * side for n in values.shape)
-    pixels = box_downsample(values[:height, :width], side) if side > 1 else values
-    fine = pixels - blurred(pixels, 4)
+def fine_structure(values: Array) -> Array:
+    """Return differences (h, w) to the neighbourhood, in units of its RMS, so that no bright corner dominates."""
+    fine = values - blurred(values, 4)
     power = blurred(np.square(fine), 12)
-    fine = fine / np.sqrt(power + np.float32(1e-3 * float(np.mean(np.square(fine))) + 1e-20))
+    return fine / np.sqrt(power + np.float32(1e-3 * float(np.mean(np.square(fine))) + 1e-20))
+
+
+def by_shift(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Return the correlation of two pictures for each shift, none in the middle; and those that are the control.
+
+    Args:
+        spectrum: product of the spectra of the pictures, one of them conjugated.
+        shape: of the pictures.
+    """
+    furthest = min(CONTROL[1], min(shape) // 2 - 1)
+    rolled: Array = np.roll(np.fft.irfft2(spectrum, shape), (furthest, furthest), (0, 1))
+    window = rolled[: 2 * furthest + 1, : 2 * furthest + 1]
+    y, x = np.abs(np.mgrid[-furthest : furthest + 1, -furthest : furthest + 1])
+    return window, window[np.maximum(x, y) >= CONTROL[0]]
+
+
+def _normalised(values: Array, side: int) -> Array:
+    """Return the fine structure of pixels of a size, with a mean of 0 and a sum of squares of 1."""
+    fine = fine_structure(box_downsample(values, side) if side > 1 else values)
     fine = fine - fine.mean()
     return fine / np.float32(max(float(np.linalg.norm(fine)), 1e-20))
 
 
 def _fit(low: Array, high: Array, side: int) -> Fit:
-    furthest = min(CONTROL[1], min(low.shape) // 2 - 1)
-    products = np.fft.irfft2(np.conj(np.fft.rfft2(low)) * np.fft.rfft2(high), low.shape)
-    window = np.roll(products, (furthest, furthest), (0, 1))[: 2 * furthest + 1, : 2 * furthest + 1]
-    y, x = np.abs(np.mgrid[-furthest : furthest + 1, -furthest : furthest + 1])
-    deviation = max(float(window[np.maximum(x, y) >= CONTROL[0]].std()), 1e-6)
+    window, control = by_shift(np.conj(np.fft.rfft2(low)) * np.fft.rfft2(high), low.shape)
+    deviation, furthest = max(float(control.std()), 1e-6), len(window) // 2
     flips = {how: float(np.sum(low * np.flip(high, axes))) / deviation for how, axes in _FLIPS.items()}
     row, column = np.unravel_index(window.argmax(), window.shape)
     best = int(column - furthest) * side, int(row - furthest) * side

@@ -17,11 +17,10 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.checks.averages import BLOCK, HrlsAverages, bounded_luminance
-from oiio_msspl.fusion.checks.colours import different_colours
+from oiio_msspl.fusion.checks.colours import different_colours, different_primaries
 from oiio_msspl.fusion.checks.edges import Aovs, judge_aovs
 from oiio_msspl.fusion.checks.framing import Framing, central_slices, find_framing, jackknife_error, parts
 from oiio_msspl.fusion.checks.likeness import ALIKE, VISIBLE, correlations, tone_mapped
-from oiio_msspl.fusion.checks.primaries import different_primaries
 from oiio_msspl.fusion.checks.same_noise import MIDDLE, compare_noise
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import bucket_side, read_lrhs, read_tile
@@ -137,9 +136,9 @@ def _judge(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> Judgem
     low = np.where(lost_low, high, low)
     scale, places = hrls.alignment.scale, (low, high)
     if scale == ONE_SIZE and min(low.shape) > 1:  # means over 2 x 2 pixels have less noise than renders of full size
-        scale, places = 2, (_halved(low), _halved(high))
+        scale, places = 2, (box_downsample(low, 2), box_downsample(high, 2))
     find = in_background(lambda: find_framing(*places))
-    aovs = in_background(lambda: judge_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
+    aovs = in_background(lambda: judge_aovs(low, hrls))
     judgement = Judgement(_holes(rendered, (low, high), hrls))
     _judge_noise(judgement, low, hrls)
     framing = find()
@@ -164,12 +163,6 @@ def _judge(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> Judgem
         )
         judgement.warnings.append(Finding("different_place", text))
     return judgement
-
-
-def _halved(image: Array) -> Array:
-    """Return the means of 2 x 2 pixels, without an odd row or column."""
-    height, width = (side // 2 * 2 for side in image.shape)
-    return box_downsample(image[:height, :width], 2)
 
 
 def _black_beauty(name: str, lit_name: str) -> InputError:
@@ -209,7 +202,7 @@ def _judge_noise(judgement: Judgement, low: Array, hrls: HrlsAverages) -> None:
     noisy, equal = hrls.blocks[..., 6:].sum(axis=(0, 1))
     middle, quarters = low[central_slices(low.shape, MIDDLE)], hrls.quarters
     if hrls.alignment.scale == ONE_SIZE and min(middle.shape) > 1:
-        middle, quarters = _halved(middle), quarters[: len(quarters) // 2 * 2, : quarters.shape[1] // 2 * 2]
+        middle, quarters = box_downsample(middle, 2), quarters[: len(quarters) // 2 * 2, : quarters.shape[1] // 2 * 2]
     same, judgement.independent = compare_noise(middle, quarters)
     if same or (noisy >= MIN_NOISY_PIXELS and equal > EQUAL_PIXELS * noisy):
         text = (
@@ -222,11 +215,7 @@ def _judge_noise(judgement: Judgement, low: Array, hrls: HrlsAverages) -> None:
 
 
 def _looks_alike(judgement: Judgement, low: Array, high: Array, framing: Framing) -> bool:
-    """Judge the brightness of blocks. Return False if it is no use to judge more.
-
-    Raises:
-        InputError: the two have nothing in common.
-    """
+    """Judge the brightness of blocks, and raise InputError if nothing is common. Return False if more is no use."""
     if framing.mirrored is not None:
         text = f"one of the two renders is mirrored {framing.mirrored}: write both in the same orientation"
         judgement.warnings.append(Finding("mirrored", text))
@@ -251,13 +240,9 @@ def _judge_aovs(judgement: Judgement, aovs: Aovs, hrls: HrlsAverages) -> None:
             f"frame, with the same crop and overscan? (--map {aov}=LAYER says which)"
         )
         judgement.warnings.append(Finding("shifted_aov", text))
-    judgement.warnings += [
-        Finding(
-            "foreign_aov",
-            f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)",
-        )
-        for aov in aovs.foreign
-    ]
+    for aov in aovs.foreign:
+        text = f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)"
+        judgement.warnings.append(Finding("foreign_aov", text))
     agree = hrls.normals_agree
     if agree is not None and agree < NEGATED:
         text = (
@@ -265,12 +250,10 @@ def _judge_aovs(judgement: Judgement, aovs: Aovs, hrls: HrlsAverages) -> None:
             "(--map normal=LAYER says which layer they are)"
         )
         judgement.warnings.append(Finding("negated_normal", text))
-    elif agree is None and hrls.normal_edges is not None:
+    elif agree is None and NORMAL in hrls.aovs:
         judgement.not_judged.append(_not_judged("which way the normals point"))
-    has = {ALBEDO: hrls.albedo is not None, NORMAL: hrls.normal_edges is not None}
-    judgement.not_judged += [
-        _not_judged(f"the {aov}") for aov, there in has.items() if there and aov not in aovs.judged
-    ]
+    unclear = (aov for aov in (ALBEDO, NORMAL) if aov in hrls.aovs and aov not in aovs.judged)
+    judgement.not_judged += [_not_judged(f"the {aov}") for aov in unclear]
 
 
 def _judge_framing(judgement: Judgement, framing: Framing, alignment: Alignment, scale: int) -> None:

@@ -76,7 +76,6 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
 
 def sample_windows(grid: Window) -> list[Window]:
     """Return different squares of at most ``SAMPLE`` pixels, evenly spread over the grid."""
-
     width, height = min(SAMPLE, grid.width), min(SAMPLE, grid.height)
     columns, rows = (
         sorted({first + round(i * rest / (SAMPLES - 1)) for i in range(SAMPLES)})

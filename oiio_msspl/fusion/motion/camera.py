@@ -53,11 +53,7 @@ class Projection:
 
 
 def find_projection(frames: TwoFrames) -> Projection | None:
-    """Find out how the matrices of a shot are to be read; None if there are none, or none fits.
-
-    Raises:
-        InputError: pixels can't be decoded.
-    """
+    """Find out how the matrices of a shot are to be read; None if there are none, or none fits."""
     if not _attributes(frames.first):
         return None
     return _by_position(frames.first) if frames.first.motion.position else _by_depth(frames)
@@ -75,8 +71,7 @@ def _by_position(render: MappedRender) -> Projection | None:
     chosen = np.linspace(0, len(x) - 1, min(len(x), SAMPLES)).astype(np.int64)
     points = positions[y[chosen], x[chosen]]
     pixels = np.stack([x[chosen] + window.x0, y[chosen] + window.y0], axis=-1).astype(np.float32)
-    matrices = ((attribute, _matrix(render, attribute)) for attribute in _attributes(render))
-    fits = (_fit(attribute, matrix, points, pixels) for attribute, matrix in matrices if matrix is not None)
+    fits = (_fit(attribute, _matrix(render, attribute), points, pixels) for attribute in _attributes(render))
     return next(filter(None, fits), None)
 
 
@@ -86,11 +81,7 @@ def _attributes(render: MappedRender) -> list[str]:
 
 
 def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Projection) -> tuple[Array, Mask]:
-    """Compute vectors to a neighbour (h, w, 2) as if all surfaces stood still, and where there are any (h, w).
-
-    Raises:
-        InputError: pixels can't be decoded.
-    """
+    """Compute vectors to a neighbour (h, w, 2) as if all surfaces stood still, and where there are any (h, w)."""
     window = render.data_window
     vectors, known = no_vectors(render)
     here, there = (_matrix(frame, projection.attribute) for frame in (render, neighbour))
@@ -190,8 +181,10 @@ def _matrix(render: MappedRender, attribute: str) -> NDArray[np.float32] | None:
     return values if np.isfinite(values).all() else None
 
 
-def _fit(attribute: str, matrix: NDArray[np.float32], points: Array, pixels: Array) -> Projection | None:
+def _fit(attribute: str, matrix: NDArray[np.float32] | None, points: Array, pixels: Array) -> Projection | None:
     """Fit the scale and shift with which a matrix projects points (n, 3) onto pixels (n, 2); None if it does not."""
+    if matrix is None:
+        return None
     seen = points @ matrix[:3] + matrix[3]
     divisor = 2 if np.allclose(matrix[:, 3], (0, 0, 0, 1)) else 3
     if np.abs(seen[:, divisor]).min() < 1e-9:

@@ -86,13 +86,20 @@ def open_frames(first: MappedRender, second: MappedRender, rows: int | None = No
     reduction = 1
     while window.width * window.height > MAX_PIXELS * reduction**2:
         reduction += 1
-
     renders = (first, second)
     names = [name for name in (ALBEDO, NORMAL) if all(has_guide(render, name) for render in renders)]
     with_position = all(render.motion.position for render in renders)
 
     def images(render: MappedRender) -> dict[str, Array]:
-        features = _smoothed_features(render, names, window, reduction) if names else {}
+        def read(part: Window) -> Array:  # one read, because layers of a part are decoded together
+            pixels = render.read(part, names)
+            return np.concatenate([pixels[name] for name in names], axis=-1)
+
+        features = {}
+        if names:  # averaged over 3 x 3 pixels, which lowers the noise of few samples
+            values = sum_3x3(reduced(read, window, reduction)) / np.float32(9)
+            parts = np.split(values, len(names), axis=-1)
+            features = {name: np.ascontiguousarray(part) for name, part in zip(names, parts, strict=True)}
         if with_position and render.motion.position:
             features[POSITION] = reduced(partial(render.file.read, render.motion.position), window, reduction)
         return features
@@ -100,18 +107,6 @@ def open_frames(first: MappedRender, second: MappedRender, rows: int | None = No
     of_first, of_second = in_parallel(*(partial(images, render) for render in renders))
     guides = tuple(Guide(name, (image, of_second[name])) for name, image in of_first.items())
     return TwoFrames(first, second, window, reduction, guides)
-
-
-def _smoothed_features(render: MappedRender, names: Sequence[str], window: Window, reduction: int) -> dict[str, Array]:
-    """Read features, reduced and averaged over 3 x 3 pixels, which lowers the noise of few samples."""
-
-    def read(part: Window) -> Array:  # one read, because layers of a part are decoded together
-        pixels = render.read(part, names)
-        return np.concatenate([pixels[name] for name in names], axis=-1)
-
-    values = sum_3x3(reduced(read, window, reduction)) / np.float32(9)
-    parts = np.split(values, len(names), axis=-1)
-    return {name: np.ascontiguousarray(part) for name, part in zip(names, parts, strict=True)}
 
 
 def has_guide(render: MappedRender, name: str, *, moves: bool = True) -> bool:
@@ -122,9 +117,8 @@ def has_guide(render: MappedRender, name: str, *, moves: bool = True) -> bool:
 
 def reduced(read: Callable[[Window], Array], window: Window, reduction: int) -> Array:
     """Read a window in strips of rows and average it down. NaN and infinities become 0."""
-    width, height = (size // reduction * reduction for size in (window.width, window.height))
     strips = []
-    for part in Window(window.x0, window.y0, window.x0 + width, window.y0 + height).bands(ROWS * reduction):
+    for part in window.bands(ROWS * reduction):
         strip = np.nan_to_num(read(part), nan=0.0, posinf=0.0, neginf=0.0)
         strips.append(box_downsample(strip, reduction) if reduction > 1 else strip)
     return np.concatenate(strips)
@@ -185,8 +179,5 @@ def still_and_moved(frames: TwoFrames) -> tuple[Mask, Mask]:
 
 def _tile_sums(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Sum up tiles. Pixels that are left over at the right and at the bottom belong to the last tile."""
-    rows = np.minimum(np.arange(values.shape[0]) // TILE, shape[0] - 1)
-    columns = np.minimum(np.arange(values.shape[1]) // TILE, shape[1] - 1)
-    by_row = np.add.reduceat(values.astype(np.float64), np.flatnonzero(np.diff(rows, prepend=-1)), axis=0)
-    result: NDArray[np.float64] = np.add.reduceat(by_row, np.flatnonzero(np.diff(columns, prepend=-1)), axis=1)
-    return result
+    rows, columns = (np.arange(count) * TILE for count in shape)
+    return np.asarray(np.add.reduceat(np.add.reduceat(values.astype(np.float64), rows, axis=0), columns, axis=1))

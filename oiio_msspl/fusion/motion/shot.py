@@ -35,11 +35,7 @@ class Motion:
 
 
 class ShotMotion:
-    """The motion between frames of a shot that follow each other, for one view.
-
-    Args:
-        source: how the motion is known.
-    """
+    """The motion between frames of a shot that follow each other, for one view, as a source knows it."""
 
     def __init__(self, source: MotionSource) -> None:
         self._source = source

@@ -127,21 +127,13 @@ class MotionSource:
         return not frames.guides or _camera_stands(*still_and_moved(frames))
 
     def misleads(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> bool:
-        """Return whether stored vectors contradict the albedo and the normals of two frames, see :func:`misleads`.
-
-        Raises:
-            InputError: pixels can't be decoded.
-        """
+        """Return whether stored vectors contradict the albedo and the normals of two frames, see :func:`misleads`."""
         return self.kind == VECTORS and misleads(*self._compared(frame, neighbour), vectors, known)
 
     def moved_objects(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
         """Find where an object has moved that :meth:`read` does not follow, so that the frames show other surfaces.
 
-        Returns:
-            (h, w) over the data window of ``frame``. None if all motion is estimated from the pixels themselves.
-
-        Raises:
-            InputError: pixels can't be decoded.
+        Return (h, w) over the data window of ``frame``; None if all motion is estimated from the pixels themselves.
         """
         return None if self.kind == FLOW else other_surfaces(*self._compared(frame, neighbour), vectors, known)
 
@@ -159,12 +151,12 @@ class MotionSource:
         Raises:
             InputError: pixels can't be decoded.
         """
-        for vectors, known in self._read_stored(hr).values():
-            for axis in self.silent:
-                lengths = np.sort(np.abs(vectors[..., "xy".index(axis)][known]))[-FEWEST:]
-                if len(lengths) == FEWEST and not is_silent(lengths[0]):
-                    return True
-        return False
+        lengths = (
+            np.sort(np.abs(vectors[..., "xy".index(axis)][known]))[-FEWEST:]
+            for vectors, known in self._read_stored(hr).values()
+            for axis in self.silent
+        )
+        return any(len(longest) == FEWEST and not is_silent(longest[0]) for longest in lengths)
 
     def channels(self, hr: MappedRender) -> list[Channel]:
         """Return the channels of a frame with its motion vectors, two for each layer and the alpha if there is one."""
@@ -250,25 +242,23 @@ def _find(
 
 def _checks(frames: TwoFrames, fields: Sequence[MotionField], verified: Mapping[str, MotionField]) -> list[FieldCheck]:
     """Verify layers by the pixels of both frames."""
-    stored = in_parallel(*(partial(_stored, frames, index, fields) for index in (0, 1)))
-    checks = (
-        _check(frames, field, stored[0].get(field.name), stored[1].get(field.name), verified.get(field.name))
-        for field in fields
-    )
+    first, second = in_parallel(*(partial(_stored, frames, index, fields) for index in (0, 1)))
+    stored = {name: (first[name], second[name]) for name in first.keys() & second.keys()}
+    checks = (_check(frames, field, stored.get(field.name), verified.get(field.name)) for field in fields)
     return [_try_premultiplied(frames, check) for check in checks]
 
 
 def _check(
-    frames: TwoFrames, field: MotionField, first: Array | None, second: Array | None, verified: MotionField | None
+    frames: TwoFrames, field: MotionField, stored: tuple[Array, Array] | None, verified: MotionField | None
 ) -> FieldCheck:
     """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
     field = replace(field, format=verified.format) if verified else field
-    if first is None or second is None:
+    if stored is None:
         return FieldCheck(field, f"{frames.second.name} lacks it")
-    check = check_field(frames, field, (first, second), verified=verified is not None)
+    check = check_field(frames, field, stored, verified=verified is not None)
     if check.zero or not {"to", "x", "y", "unit"} <= field.fixed:
         return check
-    other = check_field(frames, replace(field, fixed=frozenset({"to"})), (first, second))
+    other = check_field(frames, replace(field, fixed=frozenset({"to"})), stored)
     if not other.problem and other.fit * MARGIN < check.fit:
         fits = f"'{other.field.format}' explains {1 - other.fit:.0%} of what changes"
         return replace(check, problem=f"{fits}, and this {max(1 - check.fit, 0):.0%}")
@@ -294,25 +284,21 @@ def _try_premultiplied(frames: TwoFrames, check: FieldCheck) -> FieldCheck:
     )
     if len(divided) < len(covers):
         return check
+    none = np.float32(np.nan)
     there = [
-        check_field(frames, form, (_only(stored[0], parts[0]), _only(stored[1], parts[1])))
-        for form, stored in ((field, as_stored), (multiplied, divided))
+        check_field(frames, form, (np.where(parts[0], first, none), np.where(parts[1], second, none)))
+        for form, (first, second) in ((field, as_stored), (multiplied, divided))
     ]
     if there[1].problem or (not there[0].problem and there[1].fit * MARGIN >= there[0].fit):
         return check
     return check_field(frames, multiplied, (divided[0], divided[1]))
 
 
-def _only(stored: Array, part: Mask) -> Array:
-    """Return vectors (h, w, 2) that are NaN outside of a mask (h, w, 1)."""
-    return np.where(part, stored, np.float32(np.nan))
-
-
 def _stored(frames: TwoFrames, index: int, fields: Sequence[MotionField]) -> dict[str, Array]:
     """Read the stored vectors (h, w, 2) of a frame, by layer, not multiplied by alpha. It may lack some layers."""
     render = (frames.first, frames.second)[index]
-    channels_of = {field: render.motion.channels(field.layer, field.components) for field in fields}
-    layers = {field: channels for field, channels in channels_of.items() if channels is not None}
+    channels_of = ((field, render.motion.channels(field.layer, field.components)) for field in fields)
+    layers = {field: channels for field, channels in channels_of if channels is not None}
     if not layers:
         return {}
     alpha = [render.alpha] if render.alpha and any(field.format.premultiplied for field in layers) else []
@@ -353,21 +339,17 @@ def _without_vectors(frames: TwoFrames, checks: Sequence[FieldCheck]) -> MotionS
         seen = f"{_problems(checks)}, though the picture moves (Cycles writes zeros if motion blur is on); "
     if projection := find_projection(frames):
         places = "depth" if projection.depth else "positions"
-        text = (
-            f"{seen}the camera's matrix {projection.attribute} and {places} say where everything goes that stands still"
-        )
-        return MotionSource(CAMERA, text, projection=projection)
+        seen += f"the camera's matrix {projection.attribute} and {places} say where everything goes that stands still"
+        return MotionSource(CAMERA, seen, projection=projection)
     if any(not check.zero for check in checks):
-        return MotionSource(
-            NONE, f"{seen}describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels"
-        )
+        seen += "describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels"
+        return MotionSource(NONE, seen)
     if has_optical_flow():
         return MotionSource(FLOW, f"{seen}optical flow is computed on the fused pictures, which is less exact")
     if not frames.guides:
         seen += "no albedo, world-space normal or position that shows whether anything moves; "
-    return MotionSource(
-        NONE, f"{seen}render motion vectors, or install opencv-python-headless and use --temporal 2 for optical flow"
-    )
+    seen += "render motion vectors, or install opencv-python-headless and use --temporal 2 for optical flow"
+    return MotionSource(NONE, seen)
 
 
 def _camera_stands(still: Mask, moved: Mask) -> bool:

@@ -8,12 +8,12 @@ vectors, or wrong ones. And vectors that mislead all pixels are.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from oiio_msspl.exr.render import ReadableRender, Window
-from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import grown, means_around, sum_3x3
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices
@@ -48,9 +48,6 @@ def other_surfaces(
         names: layers of both frames that have no light, such as the albedo. Without any, no surface is another one.
         vectors: to the places of the surfaces in the neighbour, (h, w, 2) in HRLS pixels.
         known: which vectors can be believed, (h, w). Other pixels are not compared.
-
-    Raises:
-        InputError: pixels can't be decoded.
     """
     window, height = here.data_window, here.data_window.height
     result = np.zeros(known.shape, np.bool_)
@@ -60,7 +57,7 @@ def other_surfaces(
         around = slice(max(top - REACH, 0), min(last + REACH, height))
         area = Window(window.x0, window.y0 + around.start, window.x1, window.y0 + around.stop)
         layers, compared = _at_places(there, names, area, vectors[around], known[around])
-        differs = _differ(_layers(here, names, area), layers, compared)
+        differs = _differ(here.read(area, names), layers, compared)
         result[top:last] = differs[top - around.start :][: last - top]
         for render in (here, there):
             render.unload()
@@ -71,9 +68,6 @@ def misleads(here: ReadableRender, there: ReadableRender, names: Sequence[str], 
     """Return whether no motion, or the opposite vectors, lead to more alike pixels of a neighbour than the vectors.
 
     The arguments are those of :func:`other_surfaces`. A sample of the pixels votes (sign test).
-
-    Raises:
-        InputError: pixels can't be decoded.
     """
     window, other = here.data_window, there.data_window
     step = max(3, int(np.sqrt(vectors[..., 0].size / MOST_SAMPLES)))  # apart, so that their noise is independent
@@ -81,16 +75,19 @@ def misleads(here: ReadableRender, there: ReadableRender, names: Sequence[str], 
     ways = vectors[part]
     y, x = np.nonzero(known[part] & (np.hypot(ways[..., 0], ways[..., 1]) > MOVES))
     ways, x, y = ways[y, x], x * step + step // 2, y * step + step // 2
-    places = [(x + window.x0 + sign * ways[:, 0], y + window.y0 + sign * ways[:, 1]) for sign in (1, 0, -1)]
-    inside = np.logical_and.reduce([_is_inside(place, other) for place in places])
-    if not names or np.count_nonzero(inside) < FEWEST_SAMPLES:
+    signs = np.array([[1], [0], [-1]], np.float32)  # the vectors, no motion, the opposite
+    at_x, at_y = x + window.x0 + signs * ways[:, 0], y + window.y0 + signs * ways[:, 1]
+    inside = (at_x >= other.x0) & (at_x <= other.x1 - 1) & (at_y >= other.y0) & (at_y <= other.y1 - 1)
+    at_x, at_y = (places[:, inside.all(axis=0)] for places in (at_x, at_y))
+    if not names or at_x.shape[1] < FEWEST_SAMPLES:
         return False
-    votes = np.zeros((2, np.count_nonzero(inside)))
-    for own, image in zip(_layers(here, names, window), _layers(there, names, other), strict=True):
-        target = _means_at(own, *(places[1][axis][inside] - (window.x0, window.y0)[axis] for axis in (0, 1)))
+    votes = np.zeros((2, at_x.shape[1]))
+    images, of_other = here.read(window, names), there.read(other, names)
+    for name in names:
+        target = _means_at(images[name], at_x[1] - window.x0, at_y[1] - window.y0)
         errors = [
-            np.abs(_means_at(image, at_x[inside] - other.x0, at_y[inside] - other.y0) - target).sum(axis=-1)
-            for at_x, at_y in places
+            np.abs(_means_at(of_other[name], *place) - target).sum(axis=-1)
+            for place in zip(at_x - other.x0, at_y - other.y0, strict=True)
         ]
         votes += [np.sign(errors[0] - errors[rival]) for rival in (1, 2)]
     for render in (here, there):
@@ -98,11 +95,6 @@ def misleads(here: ReadableRender, there: ReadableRender, names: Sequence[str], 
     against = np.sign(votes)
     counts = np.maximum(np.count_nonzero(against, axis=1), 1)
     return bool((against.sum(axis=1) > SURE * np.sqrt(counts)).any())
-
-
-def _is_inside(place: tuple[Array, Array], window: Window) -> Mask:
-    x, y = place
-    return np.asarray((x >= window.x0) & (x <= window.x1 - 1) & (y >= window.y0) & (y <= window.y1 - 1))
 
 
 def _means_at(image: Array, x: Array, y: Array) -> Array:
@@ -117,7 +109,7 @@ def _means_at(image: Array, x: Array, y: Array) -> Array:
 
 def _at_places(
     render: ReadableRender, names: Sequence[str], area: Window, vectors: Array, known: Mask
-) -> tuple[list[Array], Mask]:
+) -> tuple[dict[str, Array], Mask]:
     """Read layers at the pixels that vectors of an area lead to; and which vectors are known and end in the frame."""
     window = render.data_window
     x = np.arange(area.x0, area.x1, dtype=np.float32) + vectors[..., 0]
@@ -127,16 +119,11 @@ def _at_places(
     first, last = (min(max(int(end), window.y0), window.y1 - 1) for end in ends)
     place = Window(window.x0, first, window.x1, last + 1)
     nearest = nearest_indices(x - place.x0, y - place.y0, (place.height, place.width))
-    layers = _layers(render, names, place)
-    return [image.reshape(-1, image.shape[-1]).take(nearest, axis=0) for image in layers], inside
+    layers = render.read(place, names)
+    return {name: image.reshape(-1, image.shape[-1]).take(nearest, axis=0) for name, image in layers.items()}, inside
 
 
-def _layers(render: ReadableRender, names: Sequence[str], window: Window) -> list[Array]:
-    layers = render.read(window, names)
-    return [layers[name] for name in names]
-
-
-def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Mask:
+def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mask) -> Mask:
     """Find the pixels (h, w) where layers (h, w, c) show another surface, and those beside them."""
     height, width = compared.shape
     result = np.empty((height, width), np.bool_)
@@ -145,8 +132,8 @@ def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Ma
         first, last, _ = rows.indices(height)
         around = slice(max(first - REACH, 0), min(last + REACH, height))
         other = np.zeros((around.stop - around.start, width), np.bool_)
-        for one, two in zip(here, there, strict=True):
-            one, two = _planes(one[around]), _planes(two[around])
+        for name, image in here.items():
+            one, two = (np.nan_to_num(planes_of(x[around]), posinf=0, neginf=0) for x in (image, there[name]))
             limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + np.float32(DIFFERENCE)
             differs = (_distance(one, two) > limit) & compared[around]
             other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
@@ -157,21 +144,12 @@ def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Ma
     return result
 
 
-def _planes(image: Array) -> Array:
-    """Return (h, w, c) as (c, h, w). NaN and infinities become 0."""
-    planes = np.moveaxis(image, -1, 0).copy(order="C")
-    planes[~np.isfinite(planes)] = 0
-    return planes
-
-
 def _roughness(planes: Array) -> Array:
     """Return the usual difference of neighbouring pixels of one surface, mean of 3 x 3 pixels (h, w)."""
     # Of two neighbours on opposite sides, at least one lies on the surface of the pixel.
     total = np.zeros(planes.shape[1:], np.float32)
-    for changes, sums in (
-        (_distance(planes[:, 1:], planes[:, :-1]), total),
-        (_distance(planes[:, :, 1:], planes[:, :, :-1]).T, total.T),
-    ):
+    for turned, sums in ((planes, total), (planes.swapaxes(1, 2), total.T)):
+        changes = _distance(turned[:, 1:], turned[:, :-1])
         if len(changes):
             sums[1:-1] += np.minimum(changes[1:], changes[:-1])
             sums[0] += changes[0]

@@ -51,9 +51,6 @@ def judged_vectors(
         Vectors (h, w, 2), 0 where they can't be believed; and where they can (h, w): they are finite, shorter than the
         frame and not clamped, alpha is not 0, they do not change too fast (:func:`_uneven`), and they are not zeros of
         a background (:func:`_doubtful_zeros`).
-
-    Raises:
-        InputError: pixels can't be decoded.
     """
     window, frame = render.data_window, render.display_window
     alpha = stored[..., 2] if render.alpha else None
@@ -168,16 +165,14 @@ def invert(own: Array, other: Array, other_known: Mask, window: Window, other_wi
 def near_borders(vectors: Array, tolerance: float) -> Mask:
     """Find the pixels (h, w) within one pixel of a border of two surfaces: vectors change there by > ``tolerance``.
 
-    Args:
-        vectors: (h, w, 2), in pixels. NaN counts as another surface.
+    ``vectors``: (h, w, 2), in pixels. NaN counts as another surface.
     """
     motion = as_complex(vectors)
-    across, down = (~(np.abs(np.diff(motion, axis=axis)) < tolerance) for axis in (1, 0))
     borders = np.zeros(motion.shape, bool)
-    for pixels in (borders[:, :-1], borders[:, 1:]):
-        pixels |= across
-    for pixels in (borders[:-1], borders[1:]):
-        pixels |= down
+    for turned, pixels in ((motion, borders), (motion.T, borders.T)):
+        differs = ~(np.abs(np.diff(turned, axis=0)) < tolerance)
+        pixels[1:] |= differs
+        pixels[:-1] |= differs
     return grown(borders)
 
 

@@ -20,7 +20,7 @@ from oiio_msspl.fusion.passes.lines import STEPS, BeautyFit, downsampled, smooth
 from oiio_msspl.fusion.passes.plan import PassJob
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
-from oiio_msspl.image.arrays import Array, planes_of, unload
+from oiio_msspl.image.arrays import Array, planes_of
 from oiio_msspl.image.filters import box_downsample, max_3x3
 
 T = TypeVar("T", bound=np.generic)
@@ -84,11 +84,6 @@ class PassSources(PassInputs):
         """
         return planes_of(mirrored(image, self.alignment.hr_data_window, area)).astype(np.float32, copy=False)
 
-    def unload(self) -> None:
-        """Give the memory of guides that wait in temporary files back to the system."""
-        for image in self.guides.values():
-            unload(image)
-
 
 def band_windows(alignment: Alignment) -> list[Window]:
     """Return the bands of LRHS rows that are fused one after the other."""
@@ -122,12 +117,12 @@ class Band:
         """The sets that have light here that no network has fused at full resolution."""
         factors = {layer.factor for job in jobs for layer in job.estimated}
         colours = {factor: name for factor, name in sources.colours.items() if factor in factors}
-        names = {name: layer for job in jobs for layer, name in job.names.items()}
+        names = {name: layer.name for job in jobs for layer, name in job.names.items()}
         # A file decodes all layers together, so all are read at once.
         needed = [*colours.values(), RGB, *names, *([ALBEDO, NORMAL] if self.to_fit else [])]
         window, counts = alignment.hr_data_window, RepairCounts()
         features = read_features(sources.high, self._hrls_area, window, needed, counts=counts, counted=self.hrls_core)
-        self.repaired = {names[name].name: count for name, count in counts.repaired.items() if name in names}
+        self.repaired = {names[name]: count for name, count in counts.repaired.items() if name in names}
         """How many values of each layer of the HRLS were NaN or infinite."""
         self.colours: dict[Factor, Array] = {
             factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in colours.items()
@@ -169,10 +164,9 @@ class Band:
         """Return whether an estimated layer, except those at full resolution, has light in the area."""
         # An LRHS of an odd size is up to a pixel away.
         low_area = Window(self.area.x0, self.area.y0 - 1, self.area.x1, self.area.y1 + 1)
-        return any(
-            not is_black(self.sources.high, name, self._hrls_area)
-            or (name in job.lrhs and not is_black(self.sources.low, name, low_area))
-            for name in (job.names[layer] for layer in job.estimated if layer not in full_size)
+        names = [job.names[layer] for layer in job.estimated if layer not in full_size]
+        return any(not is_black(self.sources.high, name, self._hrls_area) for name in names) or any(
+            not is_black(self.sources.low, name, low_area) for name in names if name in job.lrhs
         )
 
     def _compared(self, images: Guides) -> Array:

@@ -75,10 +75,10 @@ def make_exact(
 
 
 def doubts_of(job: PassJob, band: Band, hrls: Array, lrhs: Array) -> Array:
-    """Return how uncertain each layer is, (layers, h, w) over the core, at most 1.
+    """Return how uncertain each layer is, (layers, h, w) over the core, at most 1, by :meth:`Band.renders_of`.
 
     It is the root of the mean difference between the two renders, relative to the layer where that is largest. A layer
-    that the LRHS lacks is most uncertain. ``hrls``, ``lrhs``: of :meth:`Band.renders_of`.
+    that the LRHS lacks is most uncertain.
     """
     shared = in_both(job, len(hrls))
     differences = np.abs(hrls - lrhs[: len(hrls)]).mean(axis=1)
@@ -91,9 +91,7 @@ def doubts_of(job: PassJob, band: Band, hrls: Array, lrhs: Array) -> Array:
 
 
 def spread_rest(layers: Array, beauty: Array, doubts: Array | None) -> None:
-    """Change layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w).
-
-    Where all are black, they stay black.
+    """Change layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w), except black ones.
 
     Args:
         doubts: how uncertain each layer is (n, h, w), from 0 to 1. What is lacking is spread in proportion to light

@@ -16,7 +16,7 @@ from functools import partial, reduce
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.passes.bands import Band, PassInputs, PassSources, band_windows, estimated_of, in_both
@@ -24,9 +24,9 @@ from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, dou
 from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, lrhs_names
 from oiio_msspl.fusion.passes.lines import STEPS
 from oiio_msspl.fusion.passes.network import LayerFuser, LayersByNetwork
-from oiio_msspl.fusion.passes.plan import PassJob, PassPlan, plan_passes
+from oiio_msspl.fusion.passes.plan import PassJob, plan_passes
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.image.arrays import HALF_MAX, Array
+from oiio_msspl.image.arrays import HALF_MAX, Array, unload
 from oiio_msspl.image.parallel import half_of_the_threads, in_parallel, one_ahead
 
 #: What derived layers leave of the beauty counts as rounding below this share of it.
@@ -50,8 +50,7 @@ class FusedPasses:
     lacking: dict[str, float] = field(default_factory=dict)
     """By name of a fused set: the share of the beauty's light that is in no layer, for those that lack some."""
     warnings: list[Finding] = field(default_factory=list)
-    """A sentence for each set of which the LRHS has some layers only, or layers that do not sum to its beauty, or of
-    which values were too bright for half."""
+    """Sentences on sets whose layers the LRHS lacks, or do not sum to its beauty, or were too bright for half."""
 
 
 def fuse_passes(
@@ -75,9 +74,19 @@ def fuse_passes(
         InputError: pixels can't be decoded.
     """
     low, high = _read_light(inputs, by_network=fuse_layers is not None)
-    plan = plan_passes(low, high, inputs.sets)
-    jobs, sources = plan.jobs, _sources_of(inputs, low, high)
-    fused = _blank_result(plan, inputs, ReplacedChannels() if pixels is None else pixels)
+    jobs, refused, warnings = plan_passes(low, high, inputs.sets)
+    sources = _sources_of(inputs, low, high)
+    in_order = sorted(jobs, key=lambda job: inputs.sets.index(job.layers))
+    fused = FusedPasses(
+        sets=[replace(job.layers, coarser=tuple(job.coarser)) for job in in_order],
+        pixels=ReplacedChannels() if pixels is None else pixels,
+        refused=refused,
+        hrls_alone={job.layers.name: job.hrls_alone for job in in_order if job.hrls_alone},
+        lacking={job.layers.name: job.lacking for job in in_order if job.remainder},
+        warnings=warnings,
+    )
+    window = inputs.alignment.hr_data_window
+    fused.pixels.add([channel for job in jobs for channel in job.channels], window.width, window.height)
     network = LayersByNetwork(sources, jobs, fuse_layers)
     bands = len(band_windows(inputs.alignment))
     steps = pass_steps(inputs.alignment, inputs.sets, by_network=fuse_layers is not None)
@@ -102,7 +111,7 @@ def fuse_passes(
                 with half_of_the_threads():
                     made = _fuse_set(job, band, network, shares, lights)
                     new = {layer: light for layer, light in made.items() if layer not in lights}
-                    clipped[job.layers.name] += _store(new, band, inputs.alignment.hr_data_window, fused.pixels)
+                    clipped[job.layers.name] += _store(new, band, window, fused.pixels)
                 # Copies, because a layer alone would keep the memory of its whole set.
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 tell(1)
@@ -144,26 +153,13 @@ def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, La
 
 
 def _sources_of(inputs: PassInputs, low: LayerLight, high: LayerLight) -> PassSources:
-    renders: tuple[ReadableRender, ReadableRender] = (low.pixels, high.pixels)
+    lrhs, hrls = low.pixels, high.pixels
     if inputs.averaged is not None:
         # Light is divided by the colours of this frame, because those are written.
         colours = high.file.load(high.colours.values(), on_disk=is_large(high.file)).layers
-        renders = inputs.averaged[0], replace(inputs.averaged[1], layers=inputs.averaged[1].layers | colours)
-    return PassSources(**vars(inputs), low=renders[0], high=renders[1], colours=high.colours)
-
-
-def _blank_result(plan: PassPlan, inputs: PassInputs, pixels: ReplacedChannels) -> FusedPasses:
-    window = inputs.alignment.hr_data_window
-    pixels.add([channel for job in plan.jobs for channel in job.channels], window.width, window.height)
-    in_order = sorted(plan.jobs, key=lambda job: inputs.sets.index(job.layers))
-    return FusedPasses(
-        sets=[replace(job.layers, coarser=tuple(job.coarser)) for job in in_order],
-        pixels=pixels,
-        refused=plan.refused,
-        hrls_alone={job.layers.name: job.hrls_alone for job in in_order if job.hrls_alone},
-        lacking={job.layers.name: job.lacking for job in in_order if job.remainder},
-        warnings=plan.warnings,
-    )
+        lrhs, averaged = inputs.averaged
+        hrls = replace(averaged, layers=averaged.layers | colours)
+    return PassSources(**vars(inputs), low=lrhs, high=hrls, colours=high.colours)
 
 
 def _read_bands(sources: PassSources, jobs: Sequence[PassJob], network: LayersByNetwork) -> Iterator[Band]:
@@ -175,7 +171,8 @@ def _read_bands(sources: PassSources, jobs: Sequence[PassJob], network: LayersBy
 
     for band in one_ahead(map(prepare, band_windows(sources.alignment) if jobs else ())):
         yield band
-        sources.unload()
+        for image in sources.guides.values():
+            unload(image)
         network.unload()
 
 
@@ -237,8 +234,7 @@ def _sum(lights: Iterable[Array]) -> Array:
 
 def _store(lights: Mapping[AdditiveLayer, Array], band: Band, window: Window, pixels: ReplacedChannels) -> int:
     """Store layers over an HRLS of this data window. Return how many values were too bright."""
-    inside = band.hrls_core.intersect(window)
-    clipped = 0
+    inside, clipped = band.hrls_core.intersect(window), 0
     for layer, light in lights.items():
         if layer.factor in band.colours:
             light = np.divide(light, np.maximum(band.colours[layer.factor], DARKEST_COLOUR), dtype=np.float32)

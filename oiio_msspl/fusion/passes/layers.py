@@ -51,9 +51,6 @@ def light_of(
     Args:
         decode: whether all pixels are decoded now, once: into temporary files if there are many.
         decoded: the render, perhaps in memory. It is used if it has the features of :func:`with_light`.
-
-    Raises:
-        InputError: pixels can't be decoded.
     """
     file = with_light(render, names)
     needed = [RGB, ALBEDO, NORMAL, *names.values(), *_colours(names).values()]
@@ -113,17 +110,14 @@ def lrhs_names(lr: MappedRender, sets: Sequence[AdditiveSet]) -> dict[AdditiveLa
 
 
 def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[MappedRender, MappedRender]:
-    """Return LRHS and HRLS with the light of layers of additive sets as further features.
-
-    The LRHS may lack some of them.
-    """
+    """Return LRHS and HRLS with the light of layers of additive sets, which the LRHS may lack, as further features."""
     names = layer_names(sets)
-    high = {names[layer]: layer.formula for additive_set in sets for layer in additive_set.layers}
+    light = {names[layer]: layer.formula for additive_set in sets for layer in additive_set.layers}
+    high = replace(hr, features=hr.features | light)
     if lr is hr:
-        render = replace(hr, features=hr.features | high)
-        return render, render
-    low = {name: layer.formula for layer, name in lrhs_names(lr, sets).items()}
-    return replace(lr, features=lr.features | low), replace(hr, features=hr.features | high)
+        return high, high
+    light = {name: layer.formula for layer, name in lrhs_names(lr, sets).items()}
+    return replace(lr, features=lr.features | light), high
 
 
 def is_black(render: ReadableRender, name: str, area: Window | None = None) -> bool:

@@ -85,6 +85,11 @@ class LinesNearby:
         """``low``, ``full``: guides (guides, h, w) in units of their spread. ``rows``: of ``low``, to interpolate."""
         self._rows, self._scale = rows, scale
         height, width = rows.stop - rows.start, low.shape[2]
+        positions = [(phase + 0.5) / scale - 0.5 for phase in range(scale)]
+        #: For each phase, the row or column of its first corner, in :meth:`_padded`, and the weights of both corners in
+        #: linear interpolation.
+        self._corners = [int(position > 0) for position in positions]
+        self._nearness = [(1 - x, x) for x in (position if position > 0 else 1 + position for position in positions)]
         #: For each phase, the weights of the two rows and two columns of corners.
         self._weights = np.empty((scale, scale, 2, 2, height, width), np.float32)
         whole = self.phases(full[:, rows.start * scale : rows.stop * scale])
@@ -92,10 +97,10 @@ class LinesNearby:
         for y, x in np.ndindex(scale, scale):
             weights = self._weights[y, x]
             for i, j in np.ndindex(2, 2):
-                top, left = self._corner(y) + i, self._corner(x) + j
+                top, left = self._corners[y] + i, self._corners[x] + j
                 corner = padded[:, top : top + height, left : left + width]
                 distance = np.square(corner - whole[y, x]).sum(axis=0) * np.float32(SHARPER**2)
-                nearness = self._nearness(y, i) * self._nearness(x, j)
+                nearness = self._nearness[y][i] * self._nearness[x][j]
                 weights[i, j] = (np.exp(-distance) + np.float32(1e-4)) * np.float32(nearness)
             weights /= weights.sum(axis=(0, 1))
 
@@ -121,11 +126,11 @@ class LinesNearby:
             stop = min(start + CACHED_ROWS, height)
             target = out[:, start * scale : stop * scale]
             for y in range(scale):
-                rows = slice(self._corner(y) + start, self._corner(y) + stop + 1)
-                between = _between(bounds[:, rows][:, :-1], bounds[:, rows][:, 1:], self._nearness(y, 1))
+                rows = slice(self._corners[y] + start, self._corners[y] + stop + 1)
+                between = _between(bounds[:, rows][:, :-1], bounds[:, rows][:, 1:], self._nearness[y][1])
                 pairs = sliding_window_view(lines[:, rows], 2, axis=1)
                 for x in range(scale):
-                    left = self._corner(x)
+                    left = self._corners[x]
                     weights = self._weights[y, x, :, :, start:stop]
                     line, right = (
                         np.einsum("ihw,nhwi->nhw", weights[:, j], pairs[:, :, left + j : left + j + width])
@@ -136,7 +141,7 @@ class LinesNearby:
                     values *= guide[y, x, :, start:stop]
                     values += line[n:]
                     columns = between[..., left : left + width], between[..., left + 1 : left + 1 + width]
-                    limits = _between(*columns, self._nearness(x, 1))
+                    limits = _between(*columns, self._nearness[x][1])
                     np.clip(values, limits[:n], limits[n:], out=target[:, y::scale, x::scale])
 
     def _padded(self, planes: Array) -> Array:
@@ -145,16 +150,6 @@ class LinesNearby:
         top = 1 - (self._rows.start - rows.start)
         bottom = max(self._rows.stop + 1 - planes.shape[1], 0)
         return np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
-
-    def _corner(self, phase: int) -> int:
-        """Return the row or column, in :meth:`_padded`, of the first corner of a phase's first pixel."""
-        return int(2 * phase + 1 > self._scale)
-
-    def _nearness(self, phase: int, corner: int) -> float:
-        """Return the weight of the first (0) or second (1) corner of a phase in linear interpolation."""
-        position = (phase + 0.5) / self._scale - 0.5
-        second = position if position > 0 else 1 + position
-        return second if corner else 1 - second
 
 
 def _between(first: Array, second: Array, weight: float) -> Array:
@@ -223,7 +218,7 @@ class BeautyFit:
 
 
 def smoothed(planes: Array, log: Array) -> Array:
-    """Remove noise from planes (n, h, w): a guided filter (He et al. 2010) over 3 x 3 pixels.
+    """Remove noise from planes (n, h, w) by a guided filter (He et al. 2010) over 3 x 3 pixels.
 
     ``log``: the logarithm of the beauty's light, (h, w), which guides it.
     """

@@ -39,13 +39,7 @@ LayerFuser = Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Arr
 
 
 class LayersByNetwork:
-    """The layers of a frame that a network fuses, at full or at half of the resolution.
-
-    Args:
-        sources: the pair; decoded if there is a network.
-        jobs: the sets of layers.
-        fuse: the network; None to fuse nothing.
-    """
+    """The layers of a frame that a network fuses, at full or at half of the resolution; none without a network."""
 
     def __init__(self, sources: PassSources, jobs: Sequence[PassJob], fuse: LayerFuser | None) -> None:
         self._fuse, self._alignment = fuse if any(job.lrhs for job in jobs) else None, sources.alignment
@@ -60,18 +54,14 @@ class LayersByNetwork:
         return len(job.estimated) if self._fuse else 0
 
     def fuse(self, job: PassJob) -> Iterator[AdditiveLayer]:
-        """Fuse the layers of a set that have light in both renders.
-
-        Yields:
-            Each layer that is to be estimated, whether a network has fused it or not.
-        """
+        """Fuse the layers of a set that have light in both renders. Yield each estimated one, fused or not."""
         if self._fuse is None:
             return
         lit = {layer: job.names[layer] for layer in job.estimated if job.names[layer] in job.lrhs}
         lit = {layer: name for layer, name in lit.items() if not any(is_black(x, name) for x in self._renders)}
         self.unload()
-        half = self._alignment.scale == HALF and job.layers.name == LIGHT_GROUPS and len(lit) > MOST_AT_FULL_SIZE
         alignment = self._alignment
+        half = alignment.scale == HALF and job.layers.name == LIGHT_GROUPS and len(lit) > MOST_AT_FULL_SIZE
         if half:
             alignment = replace(alignment, scale=1, hr_data_window=alignment.grid)
         fused = self._fuse(self._pairs(lit.values(), half=half), alignment)

@@ -58,61 +58,51 @@ class PassJob:
         return [channel for layer in (*self.layers.layers, *self.coarser) for channel in layer.channels]
 
 
-@dataclass
-class PassPlan:
-    """What :func:`plan_passes` decides."""
-
-    jobs: list[PassJob] = field(default_factory=list)
-    """Sets with more layers come first, because layers of the others may be sums of theirs."""
-    refused: dict[str, str] = field(default_factory=dict)
-    """Why other sets are not fused, by name."""
-    warnings: list[Finding] = field(default_factory=list)
-    """A sentence for each set whose layers the LRHS lacks, or that do not sum to its beauty."""
-
-
-def plan_passes(low: LayerLight, high: LayerLight, sets: Sequence[AdditiveSet]) -> PassPlan:
+def plan_passes(
+    low: LayerLight, high: LayerLight, sets: Sequence[AdditiveSet]
+) -> tuple[list[PassJob], dict[str, str], list[Finding]]:
     """Find the sets of the HRLS that sum to its beauty, given the light of all their layers in either render.
 
-    Raises:
-        InputError: pixels can't be decoded.
+    Returns:
+        Those sets: ones with more layers come first, because layers of the others may be sums of theirs. Why others
+        are not fused, by name. And a sentence for each set whose layers the LRHS lacks, or do not sum to its beauty.
     """
-    plan = PassPlan()
+    jobs: list[PassJob] = []
+    refused: dict[str, str] = {}
+    warnings: list[Finding] = []
     for layers in sorted(sets, key=lambda additive_set: -len(additive_set.layers)):
         check, (lrhs, problem) = in_parallel(
             partial(check_light, high, layers), partial(_usable_layers, low, high, layers)
         )
         if check.problem:
-            plan.refused[layers.name] = check.text
+            refused[layers.name] = check.text
             continue
         # All derived layers come from one set. Those of two sets could have more light than the beauty.
-        derived = max((_sums_of(high, layers.layers, job.layers) for job in plan.jobs), key=len, default={})
-        taken = {channel for job in plan.jobs for channel in job.channels}
+        derived = max((_sums_of(high, layers.layers, job.layers) for job in jobs), key=len, default={})
+        taken = {channel for job in jobs for channel in job.channels}
         shared = [x.name for x in layers.layers if x not in derived and not taken.isdisjoint(x.channels)]
         if shared:
-            plan.refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
+            refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
         names = {layer: high.names[layer] for layer in layers.layers}
         job = PassJob(layers, names, lrhs, check.residual if check.remainder else 0.0, derived, check.noise_free)
-        plan.jobs.append(job)
+        jobs.append(job)
         if problem:
             text = f"{layers.name}: the LRHS's layers do not sum to its beauty, so they are not read: {problem}"
-            plan.warnings.append(Finding("passes", text))
+            warnings.append(Finding("passes", text))
         elif lrhs and job.hrls_alone:
             text = f"{layers.name}: the LRHS lacks {job.hrls_alone}, so more noise is left there"
-            plan.warnings.append(Finding("passes", text))
-    taken = {channel for job in plan.jobs for channel in job.channels}
-    for job in plan.jobs:
+            warnings.append(Finding("passes", text))
+    taken = {channel for job in jobs for channel in job.channels}
+    for job in jobs:
         for layer in job.layers.coarser:
             if taken.isdisjoint(layer.channels):
                 job.coarser.update(_sums_of(high, [layer], job.layers))
-    return plan
+    return jobs, refused, warnings
 
 
 def _sums_of(high: LayerLight, layers: Sequence[AdditiveLayer], finer: AdditiveSet) -> Sums:
-    """Return those layers that a set has, or that are sums of its layers by name and pixels.
-
-    No layer of the set belongs to two sums.
-    """
+    """Return those layers that a set has, or that are sums of its layers by name and pixels. No two share one."""
     sums: Sums = {}
     used: set[AdditiveLayer] = set()
     for layer in layers:
@@ -128,10 +118,7 @@ def _sums_of(high: LayerLight, layers: Sequence[AdditiveLayer], finer: AdditiveS
 
 
 def _usable_layers(low: LayerLight, high: LayerLight, layers: AdditiveSet) -> tuple[frozenset[str], str]:
-    """Return names of the layers that the LRHS has; and why they can't be used, if they do not sum to its beauty.
-
-    They may lack some of its light.
-    """
+    """Return names of the layers that the LRHS has; and why they can't be used, if they are no part of its beauty."""
     matches = same_layers(low.file, layers)
     problem = check_light(low, AdditiveSet(layers.name, tuple(matches.values()))).problem if matches else ""
     return (frozenset(), problem) if problem else (frozenset(high.names[layer] for layer in matches), "")

@@ -74,9 +74,6 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
 
     Args:
         total: what they should sum to; None for the beauty. Then the check also says which layers are too many.
-
-    Raises:
-        InputError: pixels can't be decoded.
     """
     layers = additive_set.layers
     outside = [layer.name for layer in layers if not _in_beauty_window(light, layer)]
@@ -115,11 +112,7 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
 
 
 def is_sum_of(light: LayerLight, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:
-    """Return whether a layer over the beauty's data window is the sum of others, on some strips of rows.
-
-    Raises:
-        InputError: pixels can't be decoded.
-    """
+    """Return whether a layer over the beauty's data window is the sum of others, on some strips of rows."""
     if not _in_beauty_window(light, layer):
         return False
     check = check_light(light, AdditiveSet(layer.name, tuple(parts)), layer)
@@ -154,10 +147,7 @@ class _Strip(NamedTuple):
 
 
 def _superfluous(light: LayerLight, layers: Sequence[AdditiveLayer]) -> list[str]:
-    """Return names of layers without which the others sum to the beauty: one, or all that are sums of others by name.
-
-    Empty if the rest would not sum to it either.
-    """
+    """Return names of layers without which the others sum to the beauty: one, all that are sums by name, or none."""
     choices = [[i] for i in range(len(layers))]
     choices.append([i for i, layer in enumerate(layers) if any(layer.words < finer.words for finer in layers)])
     total, wrong = 0.0, np.zeros(len(choices))

@@ -63,8 +63,8 @@ class TileFeatures:
     """The tile's area in HRLS pixels."""
     hrls_target: Window
     """The part of the HRLS's data window that the tile contributes."""
-    core: tuple[slice, slice]
-    """Rows and columns of ``lrhs`` that the tile contributes and that are inside the alignment's grid."""
+    core: Window
+    """The LRHS pixels that the tile contributes and that are inside the alignment's grid."""
     inside: tuple[slice, slice]
     """Rows and columns of ``lrhs`` that are inside the alignment's grid. Others only fill the tile up to its size."""
     hrls_is_lost: bool = False
@@ -128,7 +128,7 @@ def read_tile(
         lrhs_area=tile.area,
         hrls_area=area,
         hrls_target=core.intersect(alignment.hr_data_window),
-        core=tile.core.intersect(alignment.grid).slices(tile.area),
+        core=tile.core.intersect(alignment.grid),
         inside=tile.area.intersect(alignment.grid).slices(tile.area),
         hrls_is_lost=bool(lost.all()),
         failed=failed,
@@ -158,8 +158,7 @@ def bucket_side(scale: int) -> int:
 
 def _is_dead(rgb: Array) -> Mask:
     """Return the pixels (h, w) without green whose red and blue are equal: black, or magenta as of missing shaders."""
-    dead: Mask = (rgb[..., 1] == 0) & (rgb[..., 0] == rgb[..., 2])
-    return dead
+    return np.logical_and(rgb[..., 1] == 0, rgb[..., 0] == rgb[..., 2])
 
 
 def _infinite(rgb: Array) -> Mask:

@@ -32,6 +32,13 @@ NOISE_FREE = 1 / 512
 #: Exposed radiance above which light that both renders show is taken from the HRLS. Noise is hardly ever so bright in
 #: both. At a quarter of this, one of 38 rendered views has a firefly that would pass.
 LIGHT = 4096.0
+#: A surface becomes black if this many LRHS pixels around are black. Networks look as far.
+FAR = 15
+#: A surface becomes black in a pass if this many HRLS pixels around are black. Black passes are common, and a network
+#: leaves a trace of light in them.
+LAYER_REACH = 16
+#: HRLS pixels around an empty pixel that show no surface either. Thin smears have empty samples between them.
+SMEAR = 8
 
 
 def dim_fireflies(tile: TileFeatures) -> tuple[Array, dict[str, Array]]:
@@ -123,8 +130,7 @@ def _brightness_limit(rgb: Array, tile: TileFeatures) -> Array:
 def _rare_light(rgb: Array, top: int, left: int) -> Array:
     """Return the brightness of light that reaches a few pixels in most of the 3 x 3 squares around, (h, w, 3).
 
-    Args:
-        top, left: rows and columns of the first square that lie before the tile, so that tiles have equal squares.
+    ``top`` rows and ``left`` columns of the first square lie before the tile, so that tiles have equal squares.
     """
     height, width, channels = rgb.shape
     rows, columns = (-(-side // _SQUARE) for side in (top + height, left + width))
@@ -158,17 +164,6 @@ def check_finite(session: Session, *images: Array) -> None:
         )
 
 
-#: A surface becomes black if this many LRHS pixels around are black. Networks look as far.
-FAR = 15
-#: A surface becomes black in a pass if this many HRLS pixels around are black. Black passes are common, and a network
-#: leaves a trace of light in them.
-LAYER_REACH = 16
-
-
-#: HRLS pixels around an empty pixel that show no surface either. Thin smears have empty samples between them.
-SMEAR = 8
-
-
 class EmptyRegions:
     """The regions where neither render has light, and that become black, so that a transparent film stays empty.
 
@@ -199,22 +194,19 @@ class EmptyRegions:
     def mask(self, tile: TileFeatures, window: tuple[slice, slice]) -> Mask | None:
         """Return the empty HRLS pixels of a tile, (s*h, s*w, 1); None if no LRHS pixel is black.
 
-        Args:
-            window: rows and columns of the tile's area in the whole LRHS.
+        ``window``: rows and columns of the tile's area in the whole LRHS.
         """
         if not self._black[window].any():
             return None
         black = _is_zero(tile.hrls[RGB])
         empty = repeated(all_within(self._black[window], 1), tile.scale) & black
-        no_surface = all_within(_shows_no_surface(tile.hrls), SMEAR) & ~repeated(
-            self._has_rare_light[window], tile.scale
-        )
+        no_surface = all_within(_shows_no_surface(tile.hrls), SMEAR)
+        no_surface &= ~repeated(self._has_rare_light[window], tile.scale)
         far = self._black_far_around[window]
         if far.any():
             blocks = black.reshape(len(far), tile.scale, -1, tile.scale, 1)
             far = far & all_within(np.logical_and.reduce(blocks, axis=(1, 3)), self._reach)
-        empty &= no_surface | repeated(far, tile.scale)
-        return empty
+        return empty & (no_surface | repeated(far, tile.scale))
 
 
 def black_in_both(lrhs_rgb: Array, hrls_rgb: Array) -> Mask:
@@ -226,16 +218,15 @@ def black_in_both(lrhs_rgb: Array, hrls_rgb: Array) -> Mask:
 def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
     """Return the smallest rectangle around all lit pixels, ``margin`` pixels wider on each side; None if none is lit.
 
-    Args:
-        rgb: (h, w, 3) over ``window``.
+    ``rgb``: (h, w, 3) over ``window``.
     """
     values = rgb.reshape(len(rgb), -1)  # NumPy is several times as fast along one axis as along two
     rows = np.flatnonzero(values.any(axis=1))
     if not rows.size:
         return None
     columns = np.flatnonzero(values[rows[0] : rows[-1] + 1].any(axis=0)) // rgb.shape[2]
-    x0, x1, y0, y1 = columns[0] - margin, columns[-1] + 1 + margin, rows[0] - margin, rows[-1] + 1 + margin
-    return Window(int(x0), int(y0), int(x1), int(y1)).shift(window.x0, window.y0)
+    x0, y0, x1, y1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+    return Window(x0 - margin, y0 - margin, x1 + margin, y1 + margin).shift(window.x0, window.y0)
 
 
 def repeated(lrhs: NDArray[T], scale: int) -> NDArray[T]:

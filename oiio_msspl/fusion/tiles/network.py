@@ -12,19 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, RGB
-from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.fusion.tiles.alpha import fuse_alpha
-from oiio_msspl.fusion.tiles.guards import LAYER_REACH, black_in_both, check_finite, repeated
-from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile
+from oiio_msspl.fusion.tiles.features import TileFeatures, in_hrls_pixels
+from oiio_msspl.fusion.tiles.guards import LAYER_REACH, SMEAR, black_in_both, check_finite, repeated
+from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile, alpha_as_colour
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
-from oiio_msspl.image.filters import box_downsample, enlarged
+from oiio_msspl.image.filters import all_within, box_downsample, enlarged
 from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.session import Session
+
+#: Alpha that is 0 or 1 in both renders, with one pixel around, stays so if that of the network differs by less.
+INVISIBLE = 1 / 256
 
 
 @dataclass
@@ -54,9 +57,8 @@ class FusedPixels:
         """Return ``trust`` at the resolution of the HRLS, (height, width, 1); 0 without it."""
         if self.trust is None:
             return np.zeros_like(self.rgb[..., :1], np.float32)
-        scale, grid, data = self.alignment.scale, self.alignment.grid, self.alignment.hr_data_window
-        whole = enlarged(self.trust[..., None], scale)
-        return whole[data.slices(Window(grid.x0 * scale, grid.y0 * scale, grid.x1 * scale, grid.y1 * scale))]
+        scale, grid = self.alignment.scale, in_hrls_pixels(self.alignment.grid, self.alignment.scale)
+        return enlarged(self.trust[..., None], scale)[self.alignment.hr_data_window.slices(grid)]
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def _fuse_tile(task: TileTask, session: Session) -> None:
     if "alpha" in features.hrls:
         if result.alpha is None:
             result.alpha = np.empty((*result.rgb.shape[:2], 1), dtype=np.float32)
-        alpha = fuse_alpha(features, session, alpha_shares, trust=result.trust is not None)
+        alpha = _fuse_alpha(features, session, alpha_shares, trust=result.trust is not None)
         result.alpha[target] = alpha[core]
         if empty is not None and tile.lrhs is not None and tile.hrls is not None:
             empty = empty | black_in_both(tile.lrhs[RGB], tile.hrls[RGB]) & (alpha == 0)
@@ -127,10 +129,40 @@ def _fuse_tile(task: TileTask, session: Session) -> None:
             rgb = np.minimum(rgb, np.float32(HALF_MAX))
         result.rgb[target] = rgb
         if result.error is not None:
-            error = _scene_linear_error(images["fused"], images["error"], result.exposure)
+            # The network's error is one of log-encoded colours.
+            grey = encode_radiance(images["fused"], result.exposure).mean(axis=-1, keepdims=True)
+            bright = decode_radiance(grey + images["error"], result.exposure)
+            error = bright - decode_radiance(grey, result.exposure)
             if empty is not None:
                 error *= ~empty
             result.error[target] = error[core]
+
+
+def _fuse_alpha(tile: TileFeatures, session: Session, shares: Shares, *, trust: bool) -> Array:
+    """Fuse the alpha of a tile, (s*h, s*w, 1) in [0, 1], by the network as if it were a grey picture.
+
+    A pixel is exactly 1 or 0 if its LRHS pixel and the HRLS pixels around it are. A tile of such pixels only does not
+    reach the network. If the LRHS has no alpha, that of the HRLS is kept. With ``trust``, what both renders show is put
+    back, such as crisp edges (:func:`.trust_renders`).
+    """
+    hrls_alpha = np.clip(tile.hrls["alpha"], 0.0, 1.0)
+    if "alpha" not in tile.lrhs:
+        return hrls_alpha
+    lrhs_alpha = np.clip(tile.lrhs["alpha"], 0.0, 1.0)
+    exact = [repeated(lrhs_alpha == value, tile.scale) & (hrls_alpha == value) for value in (0, 1)]
+    if (exact[0] | exact[1]).all():
+        return exact[1].astype(np.float32)
+    grey = session.run(alpha_as_colour(tile.lrhs), alpha_as_colour(tile.hrls), 1.0, shares)["fused"]
+    check_finite(session, grey)
+    fused = grey.mean(axis=-1, keepdims=True)
+    if trust and RGB in shares:
+        renders = Renders(lrhs_alpha, hrls_alpha, shares[RGB], 1.0)
+        fused, _ = trust_renders(fused, renders, session.contract.overlap)
+    fused = np.clip(fused, 0.0, 1.0)
+    for value, mask in enumerate(exact):
+        near = all_within(mask, 1) & (np.abs(fused - np.float32(value)) < INVISIBLE)
+        fused[all_within(mask, SMEAR) | near] = value
+    return fused
 
 
 def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shares, reach: int) -> Array:
@@ -146,9 +178,8 @@ def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shar
     if borrowed is not None:  # there, the renders are not independent
         trust[borrowed] = 0
         picture = np.where(repeated(borrowed[..., None], renders.scale), fused, picture)
-    (rows, columns), area = tile.features.core, tile.features.lrhs_area
-    core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
-    result.trust[core.slices(result.alignment.grid)] = trust[rows, columns]
+    core, area = tile.features.core, tile.features.lrhs_area
+    result.trust[core.slices(result.alignment.grid)] = trust[core.slices(area)]
     return picture
 
 
@@ -165,12 +196,6 @@ def _run_network(tile: PreparedTile, session: Session, exposure: float, shares: 
         albedo = tile.features.hrls[ALBEDO]
         images[ALBEDO] = np.where((albedo > 1).any(axis=-1, keepdims=True), albedo, images[ALBEDO])
     return images
-
-
-def _scene_linear_error(rgb: Array, error: Array, exposure: float) -> Array:
-    """Return an error (h, w, 1) of log-encoded colours in the scene-linear units of ``rgb`` (h, w, 3)."""
-    grey = encode_radiance(rgb, exposure).mean(axis=-1, keepdims=True)
-    return decode_radiance(grey + error, exposure) - decode_radiance(grey, exposure)
 
 
 def layer_fuser(
@@ -195,10 +220,6 @@ def _fuse_layers(
     Yields:
         The fused passes, (height, width, 3) over the HRLS's data window, finite and >= 0: in temporary files if they
         have many pixels.
-
-    Raises:
-        InputError: pixels can't be decoded.
-        MssplError: the network failed, or returned NaN or infinite values.
     """
     whole = alignment.scale == beauty.alignment.scale
     layer_session = session.layer_session if whole else session.half_layer_session

@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.fusion.tiles.alpha import alpha_as_colour
 from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.guards import FAR, EmptyRegions, bright_lights, dim_fireflies, is_noise_free, lit_window
-from oiio_msspl.fusion.tiles.tiling import Tile, network_grid, plan_tiles, sample_bands
+from oiio_msspl.fusion.tiles.tiling import Tile, aligned_grid, plan_tiles, sample_bands
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.model.contract import ONE_SIZE, Contract
 from oiio_msspl.model.encoding import find_exposure
@@ -67,7 +68,7 @@ class FramePair:
         self._lr, self._hr, self._alignment, self._contract = lr, hr, alignment, contract
         self._aovs, self._share, self._on_read = aovs, share, on_read
         self._is_one_render = lr is hr
-        self.grid = network_grid(alignment, contract)
+        self.grid = aligned_grid(alignment.grid, contract.alignment)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         #: Features of the LRHS that are read tile by tile, because those of full size would take too much memory. One
         #: render has them in the HRLS, except alpha.
@@ -121,7 +122,7 @@ class FramePair:
             lrhs_rgb, hrls = dim_fireflies(features)
             colours.append((features.lrhs | {RGB: lrhs_rgb}, hrls))
             if "alpha" in features.lrhs and "alpha" in features.hrls:
-                alphas.append(alpha_as_colour(features))
+                alphas.append((alpha_as_colour(features.lrhs), alpha_as_colour(features.hrls)))
         share = self._share
         return find_shares(colours, self.exposure, share), find_shares(alphas, 1.0, share) if alphas else {}
 
@@ -144,11 +145,16 @@ class FramePair:
 
     def _lit_part(self, reach: int) -> Window | None:
         """Return the part of the grid within ``reach`` of light; None for all of it, if a render is black."""
-        scale, data = self._alignment.scale, self._alignment.hr_data_window
+        scale = self._alignment.scale
         low = lit_window(self._lrhs[RGB], self.grid, reach)
-        high = lit_window(self._hr.read(self._hr.data_window, [RGB])[RGB], data, 0)
+        high = lit_window(self._hr.read(self._hr.data_window, [RGB])[RGB], self._alignment.hr_data_window, 0)
         if low is None or high is None:
             return None
         whole = Window(high.x0 // scale, high.y0 // scale, -(-high.x1 // scale), -(-high.y1 // scale))
-        sides = min(low.x0, whole.x0), min(low.y0, whole.y0), max(low.x1, whole.x1), max(low.y1, whole.y1)
-        return Window(*sides).intersect(self.grid)
+        return low.union(whole).intersect(self.grid)
+
+
+def alpha_as_colour(render: Images) -> Images:
+    """Return albedo and normal of a render, with its alpha as a grey colour."""
+    grey = np.repeat(np.clip(render["alpha"], 0.0, 1.0), 3, axis=-1)
+    return {name: render[name] for name in (ALBEDO, NORMAL) if name in render} | {RGB: grey}

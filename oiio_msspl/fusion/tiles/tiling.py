@@ -45,13 +45,11 @@ class Tile:
     """The pixels that the network reads: the core plus the overlap, cut at the borders of the grid."""
 
 
-def network_grid(alignment: Alignment, contract: Contract) -> Window:
-    """Return the LRHS pixels that a network reads: those of the frame, extended to a size that the network takes."""
-    return aligned_grid(alignment.grid, contract.alignment)
-
-
 def aligned_grid(grid: Window, alignment: int) -> Window:
-    """Extend ``grid`` to the right and to the bottom until its sides are multiples of ``alignment``."""
+    """Extend ``grid`` to the right and to the bottom until its sides are multiples of ``alignment``.
+
+    With that of a model's contract, a network takes the size.
+    """
     width, height = (-(-side // alignment) * alignment for side in (grid.width, grid.height))
     return Window(grid.x0, grid.y0, grid.x0 + width, grid.y0 + height)
 
@@ -61,15 +59,16 @@ def plan_tiles(grid: Window, contract: Contract, part: Window | None = None) -> 
 
     No tile reaches beyond the grid: the network sees the end of the picture there, as in training. The offsets of all
     tiles are multiples of the contract's alignment, so that a network that works on blocks of pixels divides a tile as
-    it divides the frame.
-
-    Args:
-        part: cover only this part of the grid, which the tiles may exceed; None for all of it.
+    it divides the frame. Only ``part`` of the grid is covered, if given; the tiles may exceed it.
     """
     alignment = contract.alignment
     overlap = -(-contract.overlap // alignment) * alignment
     largest = TILE_MEMORY // (contract.bytes_per_pixel * contract.scale**2)
-    part = grid if part is None else _aligned_part(part, grid, alignment)
+    if part is None:
+        part = grid
+    else:  # extended to multiples of the alignment, or to the end of the grid
+        x0, y0 = part.x0 - (part.x0 - grid.x0) % alignment, part.y0 - (part.y0 - grid.y0) % alignment
+        part = aligned_grid(Window(x0, y0, part.x1, part.y1), alignment).intersect(grid)
     # The smallest tile is taken if it exceeds the memory, too. Then the fewest pixels count, then the fewest tiles.
     columns, rows = min(
         itertools.product(
@@ -89,12 +88,6 @@ def plan_tiles(grid: Window, contract: Contract, part: Window | None = None) -> 
     ]
 
 
-def _aligned_part(part: Window, grid: Window, alignment: int) -> Window:
-    """Extend a part of a grid to multiples of ``alignment``, or to the end of the grid."""
-    x0, y0 = part.x0 - (part.x0 - grid.x0) % alignment, part.y0 - (part.y0 - grid.y0) % alignment
-    return aligned_grid(Window(x0, y0, part.x1, part.y1), alignment).intersect(grid)
-
-
 def sample_bands(grid: Window, scale: int) -> list[Window]:
     """Return bands of rows, evenly spread over ``grid``, from which a frame is judged before its tiles are read.
 
@@ -106,14 +99,9 @@ def sample_bands(grid: Window, scale: int) -> list[Window]:
     return [Window(grid.x0, top, grid.x1, top + rows) for top in tops]
 
 
-def tile_count(alignment: Alignment, contract: Contract) -> int:
-    """Return the number of tiles of a frame."""
-    return len(plan_tiles(network_grid(alignment, contract), contract))
-
-
 def tile_bytes(alignment: Alignment, contract: Contract) -> int:
     """Return the bytes of the largest tile of a frame, with the network's intermediate results."""
-    grid = network_grid(alignment, contract)
+    grid = aligned_grid(alignment.grid, contract.alignment)
     corner = grid.intersect(Window(grid.x0, grid.y0, grid.x0 + _LARGEST_SIDE, grid.y0 + _LARGEST_SIDE))
     pixels = max(tile.area.width * tile.area.height for tile in plan_tiles(corner, contract))
     return pixels * contract.scale**2 * contract.bytes_per_pixel
@@ -126,7 +114,7 @@ def result_bytes(alignment: Alignment, *, error: bool) -> int:
 
 def memory_to_fuse(alignment: Alignment, contract: Contract, *, error: bool) -> int:
     """Return the smallest ``max_memory`` with which a frame can be fused, from its headers."""
-    grid = network_grid(alignment, contract)
+    grid = aligned_grid(alignment.grid, contract.alignment)
     # The LRHS lies in memory, with all features that the model may read: alpha has 1 channel, the others have 3. Of one
     # of full size, only the beauty does.
     channels = 3 if contract.scale == ONE_SIZE else 3 * len(contract.lrhs) + 1

@@ -120,8 +120,8 @@ def test_aovs_are_averaged_over_the_area_that_is_compared(scale, monkeypatch):
         features = ["rgb", "albedo", "normal"]
         averages.add(read_tile(Tile(tile, tile), lrhs, alignment.grid, hr, alignment, features, RepairCounts()))
     expected = central_area(luminance(downsample(hr.layers["albedo"], scale)))
-    assert expected.shape == averages.normal_edges.shape == (40, 40)
-    np.testing.assert_allclose(averages.albedo, expected, rtol=1e-5)
+    assert expected.shape == averages.aovs["normal"].shape == (40, 40)
+    np.testing.assert_allclose(averages.aovs["albedo"], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("how", ["box", "nearest"])

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from oiio_msspl.fusion.checks.primaries import different_primaries
+from oiio_msspl.fusion.checks.colours import different_primaries
 from oiio_msspl.image.colour import P3, REC709, conversion
 from oiio_msspl.image.filters import box_downsample
 from tests.conftest import noisy

@@ -62,8 +62,6 @@ def render_frames(
     """Let Blender render the frames of a job, and fuse each in this process, where the model stays loaded.
 
     Args:
-        program: Blender, or a Python that has bpy.
-        scene: a .blend.
         job: the frames and the settings that headless.py reads.
         folder: the folder of the results. The renders lie in it, so that a render that is kept is only renamed.
         on_event: called with each event: a step that begins, the fraction of samples that is done, the report of a
@@ -112,11 +110,6 @@ def run_blender(
     arguments: Sequence[str], fuse: Callable[[Path, Path], None], *, verbose: bool = False
 ) -> Iterator[dict[str, Any]]:
     """Run the add-on's headless.py. Leaving the loop ends Blender and every process that it started.
-
-    Args:
-        arguments: of :func:`command`.
-        fuse: see :func:`render_frames`.
-        verbose: pass on the messages of Blender.
 
     Yields:
         The events that headless.py prints, and ``{"samples": fraction}`` for each line about samples.

@@ -12,6 +12,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, remove_leftovers
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
@@ -96,7 +97,8 @@ def fuse_files(
     remove_leftovers(files.targets)
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     alignment = align(frame.lr, frame.hr)
-    if memory_to_write(alignment, frame.hr, write) <= max_memory:
+    layers = bytes_held(frame.hr.file, frame.hr.beauty_channels, write)
+    if memory_to_write(alignment, write, layers) <= max_memory:
         run.settings = replace(settings, model=choose_model(frame.lr, frame.hr, model, frame.read_if_small)[0])
     run.settings.session(alignment.scale)
     opened = time.perf_counter()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens a pair of files, maps their layers, and names the files that a frame is made from."""
+"""Opens a pair of files, maps the layers of its views, and names the files that a frame is made from."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.candidates import mapped_files
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.renderers import aov_files
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.layers import layer_by_channel
 from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.colour import REC709, SPACES, ColourSpace, encoding_of, named_space, same_space, space_of
 from oiio_msspl.jobs.sequence import frame_in_name, is_sequence, parse_pattern
 
@@ -94,10 +99,6 @@ class MappedPair(NamedTuple):
 def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> MappedPair:
     """Open both files and map their layers to features.
 
-    Args:
-        lr_path, hr_path: the low-resolution and the high-resolution render.
-        inputs: mapping, view and spp.
-
     Returns:
         LRHS and HRLS. The LRHS has albedo and normal only if its file does. It is mapped for the view of the HRLS, or
         for its own first view if it lacks that one. One render, whose path is given as both, is both.
@@ -143,17 +144,8 @@ def check_two_files(lr_path: Path, hr_path: Path) -> None:
         raise InputError(f"{lr_path}: given twice; give it alone, or two renders with a noise seed of their own")
 
 
-def map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputOptions) -> MappedPair:
-    """Map a pair for another view or view layer.
-
-    Args:
-        lr, hr: the pair, mapped for its first view.
-        view: one of ``hr.other_views``.
-        inputs: mapping and spp. An entry that means a layer of the first view by its full name means that view alone.
-
-    Raises:
-        InputError: one of the files has no such view, or can't be used for it.
-    """
+def _map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputOptions) -> MappedPair:
+    """Map a pair, which is mapped for its first view, for one of ``hr.other_views``."""
     high = map_other_hrls(hr, view, inputs)
     if lr is hr:
         high.space = hr.space
@@ -166,7 +158,11 @@ def map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputO
 
 
 def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedRender:
-    """Map the HRLS for another view, see :func:`map_other_view`."""
+    """Map the HRLS for another view. An entry that means a layer of the first view by its full name does not apply.
+
+    Raises:
+        InputError: the file has no such view, or can't be used for it.
+    """
     inputs = replace(inputs, view=view)
     try:
         render = _map_hrls(hr.file, inputs)
@@ -175,6 +171,67 @@ def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedR
         render = _map_hrls(hr.file, inputs)
     of_first_view = {name for name, formula in render.features.items() if hr.features.get(name) == formula}
     return _without_entries(render, inputs, of_first_view | _features_of_others(render))
+
+
+@dataclass(frozen=True)
+class OtherViews:
+    """The views of a pair beside the first one."""
+
+    views: tuple[MappedPair, ...] = ()
+    """Those that are fused."""
+    passed_on: tuple[str, ...] = ()
+    """Why others are not, and which beauties are not written, one sentence each."""
+
+    @property
+    def hrls(self) -> list[MappedRender]:
+        """The HRLS, mapped for each of ``views``."""
+        return [view.hr for view in self.views]
+
+
+def find_other_views(
+    lr: MappedRender, hr: MappedRender, inputs: InputOptions, write: WriteOptions = WriteOptions()
+) -> OtherViews:
+    """Find the views and view layers to fuse beside the first one: those whose beauty or passes are written.
+
+    If ``inputs`` names a view, there are no others.
+
+    Raises:
+        InputError: the first view does not fit together, or a pattern of ``write`` matches nothing.
+    """
+    if inputs.view is not None or not hr.other_views:
+        return OtherViews()
+    scale = align(lr, hr).scale
+    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
+    taken = _channels(hr)
+    views, passed_on = [], []
+    for label in hr.other_views:
+        try:
+            view = _map_other_view(lr, hr, label, inputs)
+            if (here := align(*view).scale) != scale:
+                raise InputError(f"the pair is x{here} here and x{scale} in {hr.view}")
+            if not taken.isdisjoint(view.hr.beauty_channels):
+                raise InputError("its beauty is a layer of another view")
+        except InputError as error:
+            passed_on.append(f"{name_of(label)} is passed on as it is: {error}")
+            continue
+        # A layer of no view layer may be found for several.
+        view.hr.additive_sets = [each for each in view.hr.additive_sets if taken.isdisjoint(_channels_of_set(each))]
+        made = view.hr.beauty_channels if write.passes == ("none",) else _channels(view.hr)
+        if not dropped.issuperset(made):
+            taken |= _channels(view.hr)
+            views.append(view)
+        if dropped.issuperset(view.hr.beauty_channels):
+            passed_on.append(f"the beauty of {name_of(label)} is left out, because --layers does not name it")
+    return OtherViews(tuple(views), tuple(passed_on))
+
+
+def _channels(hr: MappedRender) -> set[object]:
+    """Return the channels that may be fused for a view."""
+    return {*hr.beauty_channels}.union(*map(_channels_of_set, hr.additive_sets))
+
+
+def _channels_of_set(additive_set: AdditiveSet) -> set[object]:
+    return {channel for layer in additive_set.layers for channel in layer.channels}
 
 
 def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> ColourSpace:
@@ -203,10 +260,7 @@ def map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
     """Map the HRLS for the view that is asked for, or for its first one.
 
     If no view is asked for, an entry of the mapping that means a layer of another view layer by its full name does not
-    apply.
-
-    Raises:
-        InputError: see :func:`oiio_msspl.aovs.matching.map_render`.
+    apply. Errors are those of :func:`oiio_msspl.aovs.matching.map_render`.
     """
     render = _map_hrls(file, inputs)
     if inputs.view is None:
@@ -259,20 +313,12 @@ def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
 
 
 def files_by_name(renders: Sequence[Path], hr_path: Path, inputs: InputOptions, model: str | None) -> list[Path]:
-    """Return the files that a frame is made from without opening any, see :func:`files_read`.
+    """Return the files that a frame is made from, without opening any.
 
     Args:
         renders: the frame's pair, and the pairs of neighbours that it depends on.
-        hr_path: the frame's HRLS.
-        inputs, model: they name further files.
 
     Returns:
         The renders, in their order, and then the further files. Those of the mapping need not exist.
     """
     return [*renders, *sorted(inputs.files(hr_path, model).union(*map(aov_files, renders)))]
-
-
-def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:
-    """Return the files that a frame is made from: the pair, its siblings, the mapping's files and the user's model."""
-    paths = files_by_name([lr.file.path, hr.file.path], hr.file.path, inputs, model)
-    return {*paths, *lr.file.siblings, *hr.file.siblings}

@@ -21,11 +21,10 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
-from oiio_msspl.jobs.inputs import InputOptions, MappedPair, map_other_hrls, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, MappedPair, find_other_views, map_other_hrls, map_pair
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import family_for_layers
-from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline, neighbours
-from oiio_msspl.jobs.views import find_other_views
+from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline
 from oiio_msspl.model.catalogue import QUALITIES, family_of
 from oiio_msspl.wording import worded
 
@@ -110,13 +109,6 @@ class ShotPlan:
     def absolute(self) -> ShotPlan:
         """Return the plan with absolute paths, for workers with other working directories."""
         return replace(self, frames={n: files.absolute() for n, files in self.frames.items()})
-
-    def files_beside(self, hr: Path) -> list[Path]:
-        """Return the renders of the neighbours of the frame whose HRLS this is."""
-        number = next((n for n, files in self.frames.items() if files.hr == hr), None) if self.count else None
-        numbers = [] if number is None else neighbours(number, self.count, self.frames)
-        paths = [path for n in numbers for path in (self.frames[n].lr, self.frames[n].hr)]
-        return [path for path in paths if path is not None]
 
     def missing(self, number: int) -> list[int]:
         """Return the numbers next to a frame that lie within the shot and lack a render."""
@@ -204,12 +196,11 @@ def _other_views(
     mapped: Callable[[int], MappedPair], numbers: Sequence[int], inputs: InputOptions, write: WriteOptions
 ) -> list[str]:
     """Return the views beside the first one that are fused in some of these frames."""
-    views: dict[str, None] = {}
+    views: list[str] = []
     for number in numbers:
         with suppress(InputError):  # the run says so when the turn of this frame has come
-            others = find_other_views(*mapped(number), inputs, write)
-            views |= dict.fromkeys(view.hr.view for view in others.views)
-    return list(views)
+            views += [view.hr.view for view in find_other_views(*mapped(number), inputs, write).views]
+    return list(dict.fromkeys(views))
 
 
 def reach_of(count: int, kind: str) -> Reach:
@@ -236,12 +227,10 @@ def _motion_of(
 
     pairs = _JudgedPairs(render, options.motion_format, required)
     for number in numbers:
-        pairs.judge(number)
-        if pairs.suffice:
+        if pairs.judge(number):
             break
-    if pairs.sources:
+    if pairs.problem is None or pairs.sources:
         return pairs.verdict()
-    assert pairs.problem is not None
     if required or (options.motion_format is not None and view is None):
         raise pairs.problem
     return MotionSource(NONE, str(pairs.problem))
@@ -257,34 +246,26 @@ class _JudgedPairs:
 
     def __init__(self, render: Callable[[int], MappedRender], motion_format: str | None, required: bool) -> None:
         self._render, self._format, self._required = render, motion_format, required
-        self.sources: dict[int, MotionSource] = {}
-        """By the number of a pair's first frame."""
-        self.problem: InputError | None = None
-        """Why the first of the pairs that can't be judged can't be."""
+        self.sources: dict[int, MotionSource] = {}  # by the number of a pair's first frame
+        self.problem: InputError | None = None  # of the first pair that can't be judged
         self._vectors: MotionSource | None = None
         self._contradiction = ""
 
-    @property
-    def suffice(self) -> bool:
-        """True if no further pair needs to be judged."""
-        settled = self._vectors is not None and not self._vectors.silent
-        return settled or len(self.sources) == PAIRS_JUDGED or bool(self._contradiction)
-
-    def judge(self, number: int) -> None:
-        """Judge a frame and the next one."""
+    def judge(self, number: int) -> bool:
+        """Judge a frame and the next one. Return True if no further pair needs to be judged."""
         vectors = self._vectors
         try:
-            if vectors and not vectors.tells_more(self._render(number)):
-                self.sources[number] = vectors
-                return
-            source = self._find(number, vectors.fields if vectors else ())
+            known = vectors is not None and not vectors.tells_more(self._render(number))
+            source = vectors if known and vectors else self._find(number, vectors.fields if vectors else ())
         except InputError as error:
             self.problem = self.problem or error
             log.debug("frames %d and %d: %s", number, number + 1, error)
-            return
+            return False
         self.sources[number] = source
-        if source.kind == VECTORS:
+        if source.kind == VECTORS and not known:
             self._add_vectors(number, source)
+        settled = self._vectors is not None and not self._vectors.silent
+        return settled or len(self.sources) == PAIRS_JUDGED or bool(self._contradiction)
 
     def _find(self, number: int, verified: Sequence[MotionField]) -> MotionSource:
         pair = self._render(number), self._render(number + 1)

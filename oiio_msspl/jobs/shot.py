@@ -16,19 +16,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import InputError, MssplError, explain
-from oiio_msspl.exr.atomic import remove_leftovers
+from oiio_msspl.exr.atomic import check_folder, make_folder, remove_leftovers
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.checks import check_first_pair, check_output, look_ahead, make_output, model_of_shot
+from oiio_msspl.jobs.checks import check_first_pair, check_output, look_ahead, model_of_shot
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.farm.dask import fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
-from oiio_msspl.jobs.pipeline import run_pipeline
+from oiio_msspl.jobs.pipeline import Outcome, run_pipeline
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions, plan_temporal
 from oiio_msspl.jobs.run import ShotRun
-from oiio_msspl.jobs.sequence import FrameFiles, Shot, find_shot
+from oiio_msspl.jobs.sequence import FrameFiles, find_shot
 from oiio_msspl.jobs.settings import Settings, bytes_of
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.model.devices import require_device
@@ -108,7 +108,10 @@ def fuse_shot(
         temporal = TemporalOptions(temporal)
     shot = find_shot(lr, hr, output, frames)
     if previews:
-        shot = _with_previews(shot, view_transform)
+        if view_transform is not None:
+            check_view(view_transform)
+        frames_to_fuse = [replace(files, preview=files.output.with_suffix(".png")) for files in shot.frames]
+        shot = replace(shot, frames=frames_to_fuse)
     if client is None:  # workers of a cluster may have other devices
         require_device(device)
     path = None if report_path is None else Path(report_path)
@@ -119,7 +122,8 @@ def fuse_shot(
     settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update, strict)
     report = ShotReport(shot, temporal=plan.text, neighbours=plan.count, warnings=plan.warnings)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
-    make_output(shot)
+    make_folder(shot.output.folder)
+    check_folder(shot.output.path(0))
     running = _RunningReport(report, path, progress, start)
     existing = ExistingResults(settings, plan)
     if odd := existing.dated_in_future(shot.frames):
@@ -153,12 +157,6 @@ def fuse_shot(
     return report
 
 
-def _with_previews(shot: Shot, view_transform: str | None) -> Shot:
-    if view_transform is not None:
-        check_view(view_transform)
-    return replace(shot, frames=[replace(files, preview=files.output.with_suffix(".png")) for files in shot.frames])
-
-
 @dataclass
 class _RunningReport:
     """The report of a shot that runs, and who is told of it."""
@@ -169,7 +167,6 @@ class _RunningReport:
     start: float
 
     def add(self, result: FrameResult) -> None:
-        """Add the result of a frame."""
         self.report.results[result.frame] = result
         self.report.seconds = time.perf_counter() - self.start
         if self.progress is not None:
@@ -201,8 +198,7 @@ class _RunningReport:
         numbers = {number for number, result in results.items() if result.status == SKIPPED}
         return [frame for frame in self.report.shot.frames if frame.number in numbers]
 
-    def add_outcome(self, frame: FrameFiles, outcome: dict[str, Any] | Exception | None) -> None:
-        """Add the result of a frame: from its report, the reason for its failure, or None if its EXR existed."""
+    def add_outcome(self, frame: FrameFiles, outcome: Outcome) -> None:
         if isinstance(outcome, Exception):
             log.debug("frame %d", frame.number, exc_info=outcome)
             self.add(result_of(frame, FAILED, *explain(outcome)))

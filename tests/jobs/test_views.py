@@ -10,9 +10,8 @@ from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.inspection import inspect_file
 from oiio_msspl.jobs import files, run
-from oiio_msspl.jobs.inputs import map_pair
-from oiio_msspl.jobs.pair_check import check_files
-from oiio_msspl.jobs.views import find_other_views
+from oiio_msspl.jobs.fitting import check_files
+from oiio_msspl.jobs.inputs import find_other_views, map_pair
 from oiio_msspl.jobs.write import write_settled
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import shutil
+import sysconfig
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from msspl_cli import options
-from msspl_cli.installed import find_msspl_fuse, shipped_folder
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import make_folder, replacing
 
@@ -38,14 +39,23 @@ def nuke_install(
 
     It adds one line to DIR/init.py, which names the gizmo's folder and msspl-fuse.
     """
+    package = Path(__file__).resolve().parents[1]
+    gizmo = package / "nuke_gizmo"
+    if not gizmo.is_dir():  # an editable installation has it in the source tree
+        gizmo = package.parents[1] / "nuke_gizmo"
     target = folder.expanduser() / "init.py"
-    line = None if uninstall else install_line(shipped_folder("nuke_gizmo"), find_msspl_fuse())
+    line = None if uninstall else install_line(gizmo, find_msspl_fuse())
     changed = set_line(target, line)
     if uninstall:
         print(f"{target}: {'the line is taken out' if changed else 'there was no line of ours'}")
     else:
         print(f"{target}: {'added' if changed else 'was already there'}: {line}")
         print("Start Nuke: the node is in the toolbar under MSSPL.")
+
+
+def find_msspl_fuse() -> str | None:
+    """Find msspl-fuse beside this Python, or else on the path: hosts seldom run in an activated environment."""
+    return shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or shutil.which("msspl-fuse")
 
 
 def install_line(gizmo: Path, program: str | None) -> str:

@@ -16,8 +16,6 @@ from msspl_cli import console, options
 from msspl_cli.commands import fuse
 from msspl_cli.options import option
 
-USAGE = "[LR] HR -o OUT --bundle DIR [OPTION]..."
-
 EXAMPLES = """[bold]Examples[/bold]
 
   msspl submit lr/ hr/ -o out/ --bundle job/
@@ -109,19 +107,20 @@ def submit(
     temporal = TemporalOptions(given["temporal"], given["motion_format"])
     max_memory = bytes_of(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
-    settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view", "max_memory")}
-    settings |= {
-        "inputs": inputs,
-        "model": model,
-        "options": _passed_on(context, given),
-        "chunk": chunk,
-        "timeout": timeout,
-        "previews": given["preview"],
-        "name": name,
-        "command": command,
-        "packages": {key: wanted for key, wanted in (("conda", conda), ("rez", rez)) if wanted},
-    }
-    job = make_job(*options.low_and_high(given["renders"]), given["output"], **settings)
+    job = make_job(
+        *options.low_and_high(given["renders"]),
+        given["output"],
+        inputs=inputs,
+        model=model,
+        options=_passed_on(context, given),
+        chunk=chunk,
+        timeout=timeout,
+        previews=given["preview"],
+        name=name,
+        command=command,
+        packages={key: wanted for key, wanted in (("conda", conda), ("rez", rez)) if wanted},
+        **{name: given[name] for name in ("frames", "map_file", "device", "view", "max_memory")},
+    )
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
     with limit_threads(given["threads"]):
         check_temporal(job.shot, inputs, temporal, model, write)

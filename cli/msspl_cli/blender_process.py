@@ -32,10 +32,7 @@ _POSIX = os.name == "posix"
 
 
 def find_blender(named: str | None) -> str:
-    """Find Blender, or a Python that has bpy.
-
-    Args:
-        named: a program or its name. None: the one that MSSPL_BLENDER names, or else ``blender`` on the path.
+    """Find Blender, or a Python that has bpy: as named, or by MSSPL_BLENDER, or ``blender`` on the path.
 
     Raises:
         InputError: there is no such program.

@@ -189,7 +189,15 @@ class RenderedShot:
         if is_first:
             run.existing.check_weights(frame for frame in self._shot if frame not in self._wanted)
         with self._keep_if_it_fails(files):
-            self._take(run, files)
+            views = run.read(files)
+            views[0].require()
+            self._renders[files.number] = files
+            for frame in run.take(views):
+                self._at_work = frame.number
+                first, last = (str(beside(frame.files.output, self.suffixes[index])) for index in (0, -1))
+                frame.report.sources = (first, last) if self._keep else ("a render that was not kept",) * 2
+                write_settled(frame, run.existing)
+                self._warnings[frame.files.output] = frame.report.warnings
         self._discard()
 
     @contextmanager
@@ -204,18 +212,6 @@ class RenderedShot:
             if len(self._shot) > 1:
                 said = f"frame {self._at_work}: {said}"
             raise (InputError if code == InputError.exit_code else MssplError)(said) from error
-
-    def _take(self, run: ShotRun, files: FrameFiles) -> None:
-        """Fuse a frame that is rendered, and write each frame that has all its neighbours now."""
-        views = run.read(files)
-        views[0].require()
-        self._renders[files.number] = files
-        for frame in run.take(views):
-            self._at_work = frame.number
-            lr, hr = (str(beside(frame.files.output, self.suffixes[index])) for index in (0, -1))
-            frame.report.sources = (lr, hr) if self._keep else ("a render that was not kept",) * 2
-            write_settled(frame, run.existing)
-            self._warnings[frame.files.output] = frame.report.warnings
 
     def _start(self, files: FrameFiles) -> ShotRun:
         plan = self._plan
@@ -233,11 +229,7 @@ class RenderedShot:
     def _keep_failed(self, files: FrameFiles, said: str) -> str:
         """Keep the renders of a frame that can't be fused. The rest of the temporary files is deleted.
 
-        Args:
-            said: the error. It may name the renders.
-
-        Returns:
-            The error, with the names of the files that are kept.
+        Return the error ``said``, which may name the renders, with the names of the files that are kept.
         """
         kept = self._places(files)
         if not all(path.exists() for path in kept):  # Blender wrote none, and the error says so

@@ -18,7 +18,7 @@ from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.fusion.fuse import check_model
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.jobs.fitting import check_files
-from oiio_msspl.jobs.inputs import InputOptions, find_other_views, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, find_views, map_pair
 from oiio_msspl.jobs.memory import check_frame_memory
 from oiio_msspl.jobs.passes import check_layers, sets_to_fuse
 from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
@@ -141,7 +141,7 @@ def look_ahead(frames: Sequence[FrameFiles], settings: Settings) -> dict[str, An
         try:
             lr, hr = map_pair(frame.lr, frame.hr, settings.inputs)
             scale = align(lr, hr).scale
-            views = [hr, *find_other_views(lr, hr, settings.inputs, settings.write).hrls]
+            views = [view.hr for view in find_views(lr, hr, settings.inputs, settings.write)[0]]
             sets = {
                 additive.name: additive.layer_names for view in views for additive in sets_to_fuse(view, settings.write)
             }
@@ -174,12 +174,12 @@ def check_wanted_outputs(
         try:
             lr, hr = map_pair(frame.lr, frame.hr, inputs)
             scale = align(lr, hr).scale
-            others = find_other_views(lr, hr, inputs, write)
+            views, _ = find_views(lr, hr, inputs, write)
         except InputError as error:
             if all(path.exists() for path in inputs.files(frame.hr, None)):  # others may exist on the workers only
                 problem = problem or error
             continue
-        check_layers([hr, *others.hrls], write)
+        check_layers([view.hr for view in views], write)
         session = Settings(write=write, model=model).session(scale)
         check_model(session, scale, error=write.error_layer)
         layers = bytes_held(hr.file, hr.beauty_channels, write)

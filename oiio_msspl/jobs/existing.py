@@ -61,7 +61,7 @@ class ExistingResults:
         written = files.output.stat().st_mtime
         beside = neighbours(files.number, self.plan.count, self.plan.frames)
         renders = [path for frame in (files, *map(self.plan.frames.__getitem__, beside)) for path in frame.pair]
-        paths = files_by_name(renders, files.hr, self.settings.inputs, self.settings.model)
+        paths = files_by_name(renders, self.settings.inputs, self.settings.model)
         return [path for path in paths if path.is_file() and path.stat().st_mtime > written]
 
     def dated_in_future(self, frames: Sequence[FrameFiles]) -> Path | None:

@@ -14,7 +14,7 @@ from oiio_msspl.fusion.checks.pair import BOTH_BLACK, check_renders
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.jobs.advice import advise
-from oiio_msspl.jobs.inputs import InputOptions, both_paths, find_other_views, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, both_paths, find_views, map_pair
 from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
 from oiio_msspl.jobs.report import merged
 from oiio_msspl.jobs.sequence import Shot, find_shot, next_file
@@ -86,8 +86,7 @@ def check_files(
     lr, hr = None if lr is None else Path(lr), Path(hr)
     try:
         first = map_pair(*both_paths(lr, hr), inputs)
-        others = find_other_views(*first, inputs)
-        views = [first, *((view.lr, view.hr) for view in others.views)]
+        views, passed_on = find_views(*first, inputs)
         judgements = {high.view: check_renders(low, high) for low, high in views if low is not high}
         warnings, not_judged = (
             merged({view: getattr(judgement, name) for view, judgement in judgements.items()})
@@ -101,7 +100,7 @@ def check_files(
             warnings=warnings,
             advice=advise(*first, spread, in_shot=in_shot),
             not_judged=not_judged,
-            passed_on=others.passed_on,
+            passed_on=passed_on,
             size=first.hr.display_window.size,
             aovs=tuple(sorted(first.hr.features)),
         )

@@ -28,7 +28,7 @@ from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.passes.layers import is_large, layer_names, lrhs_names, pass_features, with_light
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array, Mask, kept
-from oiio_msspl.jobs.inputs import MappedPair, files_by_name, find_other_views, map_pair
+from oiio_msspl.jobs.inputs import MappedPair, files_by_name, find_views, map_pair
 from oiio_msspl.jobs.memory import ViewMemory, light_features
 from oiio_msspl.jobs.passes import Progress, check_layers, sets_to_fuse
 from oiio_msspl.jobs.plan import ShotPlan, ViewPlan
@@ -237,19 +237,18 @@ def _open(frames: Sequence[ShotFrame], settings: Settings) -> list[ShotFrame]:
     first, inputs, write = frames[0], settings.inputs, settings.write
     files = first.files
     lr, hr = map_pair(*files.pair, inputs)
-    others = find_other_views(lr, hr, inputs, write)
-    read = files_by_name(files.pair, files.pair[1], inputs, settings.model)
+    views, first.passed_on = find_views(lr, hr, inputs, write)
+    read = files_by_name(files.pair, inputs, settings.model)
     check_separate({*read, *lr.file.siblings, *hr.file.siblings}, files.targets)
     align(lr, hr)  # refuses the pair before its pixels are read
-    check_layers([hr, *others.hrls], write)
-    pairs: dict[str | None, MappedPair] = {None: MappedPair(lr, hr)}
-    pairs.update({view.hr.view: view for view in others.views})
+    check_layers([view.hr for view in views], write)
+    pairs: dict[str | None, MappedPair] = {view.hr.view: view for view in views[1:]}
+    pairs[None] = views[0]
     present = [frame for frame in frames if frame.view in pairs]
     planned = {frame.view for frame in frames}
     first.others = [ShotFrame(files, name, state=State.READ) for name in pairs if name not in planned]
     for frame in (*present, *first.others):
         _set_pair(frame, *pairs[frame.view], settings)
-    first.passed_on = others.passed_on
     return present
 
 

@@ -7,6 +7,7 @@ import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -132,10 +133,9 @@ def both_paths(lr_path: str | Path | None, hr_path: str | Path) -> tuple[Path, P
     Raises:
         InputError: both are the same file.
     """
-    if lr_path is None:
-        return Path(hr_path), Path(hr_path)
-    check_two_files(Path(lr_path), Path(hr_path))
-    return Path(lr_path), Path(hr_path)
+    if lr_path is not None:
+        check_two_files(Path(lr_path), Path(hr_path))
+    return Path(hr_path if lr_path is None else lr_path), Path(hr_path)
 
 
 def check_two_files(lr_path: Path, hr_path: Path) -> None:
@@ -173,37 +173,24 @@ def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedR
     return _without_entries(render, inputs, of_first_view | _features_of_others(render))
 
 
-@dataclass(frozen=True)
-class OtherViews:
-    """The views of a pair beside the first one."""
-
-    views: tuple[MappedPair, ...] = ()
-    """Those that are fused."""
-    passed_on: tuple[str, ...] = ()
-    """Why others are not, and which beauties are not written, one sentence each."""
-
-    @property
-    def hrls(self) -> list[MappedRender]:
-        """The HRLS, mapped for each of ``views``."""
-        return [view.hr for view in self.views]
-
-
-def find_other_views(
+def find_views(
     lr: MappedRender, hr: MappedRender, inputs: InputOptions, write: WriteOptions = WriteOptions()
-) -> OtherViews:
-    """Find the views and view layers to fuse beside the first one: those whose beauty or passes are written.
+) -> tuple[list[MappedPair], tuple[str, ...]]:
+    """Find the views and view layers to fuse: those whose beauty or passes are written, or the one ``inputs`` names.
 
-    If ``inputs`` names a view, there are no others.
+    Returns:
+        The pair, mapped for each of them, the first one in front as it is given. And why other views are not fused, and
+        which beauties are not written, one sentence each.
 
     Raises:
         InputError: the first view does not fit together, or a pattern of ``write`` matches nothing.
     """
     if inputs.view is not None or not hr.other_views:
-        return OtherViews()
+        return [MappedPair(lr, hr)], ()
     scale = align(lr, hr).scale
     dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
     taken = _channels(hr)
-    views, passed_on = [], []
+    views, passed_on = [MappedPair(lr, hr)], []
     for label in hr.other_views:
         try:
             view = _map_other_view(lr, hr, label, inputs)
@@ -222,7 +209,7 @@ def find_other_views(
             views.append(view)
         if dropped.issuperset(view.hr.beauty_channels):
             passed_on.append(f"the beauty of {name_of(label)} is left out, because --layers does not name it")
-    return OtherViews(tuple(views), tuple(passed_on))
+    return views, tuple(passed_on)
 
 
 def _channels(hr: MappedRender) -> set[object]:
@@ -302,23 +289,15 @@ def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
     # the other layers, and an entry may name an EXR of the HRLS's size. Nor need it have the layers of the user's sums.
     features = [name for name in (ALBEDO, NORMAL) if name not in inputs.mapping]
     mapping = {name: layer for name, layer in inputs.mapping.items() if name == RGB}
-
-    def map_with(sums: Sequence[str]) -> MappedRender:
-        return map_render(file, mapping, view=inputs.view, spp=inputs.lr_spp, features=features, sums=sums)
-
-    if inputs.sums:
-        with contextlib.suppress(InputError):
-            return map_with(inputs.sums)
-    return map_with(())
+    mapped = partial(map_render, file, mapping, view=inputs.view, spp=inputs.lr_spp, features=features)
+    with contextlib.suppress(InputError):
+        return mapped(sums=inputs.sums)
+    return mapped()
 
 
-def files_by_name(renders: Sequence[Path], hr_path: Path, inputs: InputOptions, model: str | None) -> list[Path]:
-    """Return the files that a frame is made from, without opening any.
+def files_by_name(renders: Sequence[Path], inputs: InputOptions, model: str | None) -> list[Path]:
+    """Return the files that a frame is made from, without opening any. Those of the mapping need not exist.
 
-    Args:
-        renders: the frame's pair, and the pairs of neighbours that it depends on.
-
-    Returns:
-        The renders, in their order, and then the further files. Those of the mapping need not exist.
+    The first ones are ``renders``: the frame's pair, and the pairs of neighbours that it depends on.
     """
-    return [*renders, *sorted(inputs.files(hr_path, model).union(*map(aov_files, renders)))]
+    return [*renders, *sorted(inputs.files(renders[1], model).union(*map(aov_files, renders)))]

@@ -21,7 +21,7 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
-from oiio_msspl.jobs.inputs import InputOptions, MappedPair, find_other_views, map_other_hrls, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, MappedPair, find_views, map_other_hrls, map_pair
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import family_for_layers
 from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline
@@ -199,7 +199,7 @@ def _other_views(
     views: list[str] = []
     for number in numbers:
         with suppress(InputError):  # the run says so when the turn of this frame has come
-            views += [view.hr.view for view in find_other_views(*mapped(number), inputs, write).views]
+            views += [view.hr.view for view in find_views(*mapped(number), inputs, write)[0][1:]]
     return list(dict.fromkeys(views))
 
 

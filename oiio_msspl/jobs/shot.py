@@ -130,11 +130,11 @@ def fuse_shot(
         log.warning(
             worded(f"{odd}: is dated in the future, so --update can't tell what is newer; set its date (touch)")
         )
-    to_fuse = running.add_known(existing, earlier)
+    to_fuse, skipped = running.add_known(existing, earlier)
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model))
-        ExistingResults(settings, plan).check_weights(running.skipped())
+        ExistingResults(settings, plan).check_weights(skipped)
         report.found = look_ahead(to_fuse, settings)
         if client is None and report.found is not None:
             settings.session(report.found["scale"])  # a model that can't be used is refused before anything is told
@@ -172,31 +172,29 @@ class _RunningReport:
         if self.progress is not None:
             self.progress(result, self.report)
 
-    def add_known(self, existing: ExistingResults, earlier: dict[int, dict[str, Any]]) -> list[FrameFiles]:
-        """Add the frames that are skipped, missing or blocked by an existing file, and return those to fuse.
+    def add_known(
+        self, existing: ExistingResults, earlier: dict[int, dict[str, Any]]
+    ) -> tuple[list[FrameFiles], list[FrameFiles]]:
+        """Add the frames that are skipped, missing or blocked by an existing file. Return those to fuse and to skip.
 
         A skipped frame keeps its entry of an ``earlier`` report.
         """
-        to_fuse = []
+        to_fuse, skipped = [], []
         for frame in self.report.shot.frames:
             result = existing.known_result(frame, self.report.shot)
             if result is None:
                 to_fuse.append(frame)
                 continue
-            if result.status == SKIPPED and (entry := earlier.get(frame.number)):
-                warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
-                result = replace(result, **entry | {"warnings": warnings})
+            if result.status == SKIPPED:
+                skipped.append(frame)
+                if entry := earlier.get(frame.number):
+                    warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
+                    result = replace(result, **entry | {"warnings": warnings})
             self.add(result)
         first = self.report.first
         if first is not None and first["frame"] in {frame.number for frame in to_fuse}:
             self.report.first = None  # its result is replaced
-        return to_fuse
-
-    def skipped(self) -> list[FrameFiles]:
-        """Return the frames that are skipped so far."""
-        results = self.report.results
-        numbers = {number for number, result in results.items() if result.status == SKIPPED}
-        return [frame for frame in self.report.shot.frames if frame.number in numbers]
+        return to_fuse, skipped
 
     def add_outcome(self, frame: FrameFiles, outcome: Outcome) -> None:
         if isinstance(outcome, Exception):
@@ -210,8 +208,7 @@ class _RunningReport:
     def save(self) -> None:
         """Save the report after a frame. A failure is only logged, because a full disk may have room later."""
         try:
-            if self.path is not None:
-                self.report.save(self.path)
+            self.close()
         except MssplError as error:
             log.warning("%s", error)
 

@@ -67,12 +67,7 @@ def install_line(gizmo: Path, program: str | None) -> str:
 def set_line(path: Path, line: str | None) -> bool:
     """Make ``line`` our only line in a file, at its end. All other bytes stay.
 
-    Args:
-        path: init.py, which need not exist.
-        line: ends with ``MARKER``. None removes our line.
-
-    Returns:
-        Whether the file changed.
+    The file need not exist. The line ends with ``MARKER``; None removes it. Return whether the file changed.
 
     Raises:
         InputError: the folder is missing, or the file can't be read.

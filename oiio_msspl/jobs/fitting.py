@@ -198,11 +198,9 @@ def _differences(frames: dict[int, PairCheck]) -> list[Finding]:
     first, reference = next(iter(frames.items()))
     warnings = []
     for number, pair in frames.items():
-        pairs = {"the frame is": (pair.size, reference.size)}
-        pairs["the layers found are"] = ", ".join(pair.aovs), ", ".join(reference.aovs)
-        warnings += [
-            Finding("flicker", f"frame {number}: {what} {here} here and {there} in frame {first}: it may flicker")
-            for what, (here, there) in pairs.items()
-            if here != there
-        ]
+        layers = ("the layers found are", ", ".join(pair.aovs), ", ".join(reference.aovs))
+        for what, here, there in (("the frame is", pair.size, reference.size), layers):
+            if here != there:
+                text = f"frame {number}: {what} {here} here and {there} in frame {first}: it may flicker"
+                warnings.append(Finding("flicker", text))
     return warnings

@@ -38,7 +38,7 @@ from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.image.parallel import in_background
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import ShotFrame, State
-from oiio_msspl.jobs.report import FrameReport, provenance
+from oiio_msspl.jobs.report import provenance
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,14 @@ def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bo
         )
 
     def preview() -> None:
-        _write_preview(report, picture, settings.view_transform, overwrite=overwrite_preview)
+        if report.preview is None:
+            return
+        about = report.hr.data_window, report.hr.display_window, settings.view_transform, report.hr.space
+        try:
+            write_preview(report.preview, picture.rgb, *about, overwrite=overwrite_preview)
+        except MssplError as error:  # a frame is good without its preview
+            report.warnings.append(Finding("no_preview", f"no preview: {error}"))
+            report.preview = None
 
     if overwrite and any(path is not None and path.exists() for path in (report.output, report.preview)):
         old = old_preview(report.output)  # shows the old frame, and the new preview may fail or may not be wanted
@@ -146,18 +153,3 @@ def _layers_about(fused: FusedFrame, options: WriteOptions) -> dict[str, NDArray
         names = {ALBEDO: ALBEDO_LAYER, NORMAL: NORMAL_LAYER}
         layers |= {names[feature]: pixels for feature, pixels in fused.clean_aovs.items()}
     return layers
-
-
-def _write_preview(report: FrameReport, fused: FusedFrame, view: str | None, *, overwrite: bool) -> None:
-    """Write the PNG that the report names, if any.
-
-    A frame is good without its preview, so a failure is added to the report as a warning.
-    """
-    if report.preview is None:
-        return
-    windows = (report.hr.data_window, report.hr.display_window)
-    try:
-        write_preview(report.preview, fused.rgb, *windows, view, report.hr.space, overwrite=overwrite)
-    except MssplError as error:
-        report.warnings.append(Finding("no_preview", f"no preview: {error}"))
-        report.preview = None

@@ -32,11 +32,7 @@ _POSIX = os.name == "posix"
 
 
 def find_blender(named: str | None) -> str:
-    """Find Blender, or a Python that has bpy: as named, or by MSSPL_BLENDER, or ``blender`` on the path.
-
-    Raises:
-        InputError: there is no such program.
-    """
+    """Find Blender, or a Python that has bpy: as named, or by MSSPL_BLENDER, or ``blender`` on the path."""
     for where, name in (("--blender", named), ("MSSPL_BLENDER", os.environ.get("MSSPL_BLENDER")), ("", "blender")):
         program = shutil.which(os.path.expanduser(name)) if name else None
         if program is not None:

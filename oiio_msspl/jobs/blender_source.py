@@ -127,11 +127,7 @@ class RenderedShot:
         return self._plan.text
 
     def fuse_alone(self, reason: str) -> None:
-        """Fuse every frame by itself. No frame has been fused yet.
-
-        Raises:
-            InputError: the user has asked for neighbours.
-        """
+        """Fuse every frame by itself, before any is fused. Raise InputError if the user has asked for neighbours."""
         if self._required:
             raise InputError(f"--temporal {self._plan.count}: {reason}")
         self._plan = ShotPlan(text=f"frame by frame: {reason}")

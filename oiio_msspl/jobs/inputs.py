@@ -128,11 +128,7 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
 
 
 def both_paths(lr_path: str | Path | None, hr_path: str | Path) -> tuple[Path, Path]:
-    """Return the paths of the LRHS and of the HRLS; that of the only render as both, if ``lr_path`` is None.
-
-    Raises:
-        InputError: both are the same file.
-    """
+    """Return the paths of the LRHS and of the HRLS, which may not be one file; that of the only render as both."""
     if lr_path is not None:
         check_two_files(Path(lr_path), Path(hr_path))
     return Path(hr_path if lr_path is None else lr_path), Path(hr_path)

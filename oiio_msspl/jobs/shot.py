@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuses a shot: every frame of two sequences, or of one, in this process or on a Dask cluster.
 
-A bad frame is reported and does not stop the others. A new EXR gets its name last, after its preview, so an EXR that
-exists is a complete frame. An EXR that is replaced comes before its preview, so a run that is killed between the two
-leaves the new frame without a preview.
+A bad frame is reported and does not stop the others. An EXR that is replaced comes before its preview, so a run that is
+killed between the two leaves the new frame without a preview.
 """
 
 from __future__ import annotations
@@ -213,11 +212,7 @@ class _RunningReport:
             log.warning("%s", error)
 
     def close(self) -> None:
-        """Save the report at the end of the run.
-
-        Raises:
-            MssplError: the file system refused.
-        """
+        """Save the report at the end of the run. Raise MssplError if the file system refuses."""
         self.report.seconds = time.perf_counter() - self.start
         if self.path is not None:
             self.report.save(self.path)

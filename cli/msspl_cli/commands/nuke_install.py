@@ -44,8 +44,11 @@ def nuke_install(
     if not gizmo.is_dir():  # an editable installation has it in the source tree
         gizmo = package.parents[1] / "nuke_gizmo"
     target = folder.expanduser() / "init.py"
-    line = None if uninstall else install_line(gizmo, find_msspl_fuse())
-    changed = set_line(target, line)
+    # A program that the environment or a knob names has priority.
+    program = find_msspl_fuse()
+    environment = f'os.environ.setdefault("MSSPL_FUSE", {Path(program).as_posix()!r}); ' if program else ""
+    line = f"import os, nuke; {environment}nuke.pluginAddPath({gizmo.as_posix()!r})  {MARKER}"
+    changed = set_line(target, None if uninstall else line)
     if uninstall:
         print(f"{target}: {'the line is taken out' if changed else 'there was no line of ours'}")
     else:
@@ -56,12 +59,6 @@ def nuke_install(
 def find_msspl_fuse() -> str | None:
     """Find msspl-fuse beside this Python, or else on the path: hosts seldom run in an activated environment."""
     return shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or shutil.which("msspl-fuse")
-
-
-def install_line(gizmo: Path, program: str | None) -> str:
-    """Build the line for init.py. A program that the environment or a knob names has priority."""
-    environment = f'os.environ.setdefault("MSSPL_FUSE", {Path(program).as_posix()!r}); ' if program else ""
-    return f"import os, nuke; {environment}nuke.pluginAddPath({gizmo.as_posix()!r})  {MARKER}"
 
 
 def set_line(path: Path, line: str | None) -> bool:

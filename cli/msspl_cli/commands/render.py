@@ -189,11 +189,7 @@ def render(
 
 
 def _count_renders(renders: int | None, scale: int, lr_spp: int | None) -> int:
-    """Return how often a frame is rendered.
-
-    Raises:
-        InputError: there is no such scale, or the options do not fit together.
-    """
+    """Return how often a frame is rendered. Raise InputError if the options do not fit together."""
     from oiio_msspl.model.contract import ONE_SIZE, SCALES
 
     if scale not in (ONE_SIZE, *SCALES):
@@ -206,11 +202,7 @@ def _count_renders(renders: int | None, scale: int, lr_spp: int | None) -> int:
 
 
 def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Path]]:
-    """Pair frame numbers with files. Without ``frames`` it is the frame at which the scene was saved.
-
-    Raises:
-        InputError: one name for several frames, a pattern without frames, or a name of another kind of file.
-    """
+    """Pair frame numbers with files. The number is None without ``frames``: the frame at which the scene was saved."""
     from oiio_msspl.jobs.sequence import parse_frames, parse_pattern
 
     numbers = [] if frames is None else parse_frames(frames)

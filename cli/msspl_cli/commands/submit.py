@@ -142,6 +142,8 @@ def submit(
 
 def _passed_on(context: typer.Context, given: dict[str, Any]) -> list[str]:
     """Return the arguments that every task gets: those that are not the default of their option."""
+    from oiio_msspl.aovs.mapping import is_exr
+
     defaults = {name: parameter.default for name, parameter in inspect.signature(fuse.fuse).parameters.items()}
     arguments = []
     for parameter in context.command.params:
@@ -154,14 +156,9 @@ def _passed_on(context: typer.Context, given: dict[str, Any]) -> list[str]:
         elif name == "verbose":
             arguments += [parameter.opts[0]] * value
         else:
-            for text in value if isinstance(value, list | tuple) else [value]:
-                arguments += [parameter.opts[0], _full_path(text) if name == "mapping" else str(text)]
+            for text in map(str, value if isinstance(value, list | tuple) else [value]):
+                feature, _, layer = text.partition("=")
+                if name == "mapping" and is_exr(layer):  # tasks run in other folders
+                    text = f"{feature}={Path(layer).absolute()}"
+                arguments += [parameter.opts[0], text]
     return arguments
-
-
-def _full_path(mapping: str) -> str:
-    """Make the path of a ``--map`` absolute if it names an EXR, because tasks run in other folders."""
-    from oiio_msspl.aovs.mapping import is_exr
-
-    feature, equals, layer = mapping.partition("=")
-    return f"{feature}{equals}{Path(layer).absolute()}" if is_exr(layer) else mapping

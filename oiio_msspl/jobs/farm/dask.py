@@ -133,11 +133,7 @@ def fuse_frames(
 
 
 def _most_workers_on_a_machine(client: Client) -> int:
-    """Return the largest number of workers that share the cores of one machine.
-
-    Raises:
-        InputError: a worker takes several frames at a time.
-    """
+    """Return how many workers share a machine at the most. Raise InputError if one takes several frames at a time."""
     if not client.scheduler_info()["workers"]:
         log.warning("%s has no workers yet; waiting for the first", client.scheduler.address)
         client.wait_for_workers(1)

@@ -77,16 +77,16 @@ def fuse_files(
     if is_sequence(output):
         raise InputError(f"{output}: is a pattern, but LR and HR are single files; name one file")
     max_memory = bytes_of(max_memory)
-    if preview_path is True:
-        preview_path = output.with_suffix(".png")
+    preview = None
     if preview_path:
-        preview_path = check_target(preview_path, overwrite=overwrite)
-        if preview_path.suffix.lower() != ".png":
-            raise InputError(f"{preview_path}: the preview is a PNG; name it .png")
+        preview = check_target(
+            output.with_suffix(".png") if preview_path is True else preview_path, overwrite=overwrite
+        )
+        if preview.suffix.lower() != ".png":
+            raise InputError(f"{preview}: the preview is a PNG; name it .png")
         if view_transform is not None:
             check_view(view_transform)
     settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite, strict=strict)
-    preview = Path(preview_path) if preview_path else None
     files = FrameFiles(0, *both_paths(lr_path, hr_path), output, preview)
     if progress is not None:
         progress(0, WHOLE)

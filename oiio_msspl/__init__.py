@@ -34,13 +34,12 @@ if TYPE_CHECKING:
     from oiio_msspl.jobs.arrays import fuse_arrays
     from oiio_msspl.jobs.farm.openjd import Job, make_job, write_bundle
     from oiio_msspl.jobs.files import fuse_files
+    from oiio_msspl.jobs.fitting import PairCheck, ShotCheck, check_files, check_shot
     from oiio_msspl.jobs.inputs import InputOptions
-    from oiio_msspl.jobs.pair_check import PairCheck, check_files
     from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.report import FrameReport
     from oiio_msspl.jobs.sequence import Shot, find_shot
     from oiio_msspl.jobs.shot import fuse_shot
-    from oiio_msspl.jobs.shot_check import ShotCheck, check_shot
     from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
     from oiio_msspl.model.catalogue import find_model, shipped_models
     from oiio_msspl.model.contract import Contract
@@ -58,17 +57,17 @@ _MODULES = {
     "Job": "jobs.farm.openjd",
     "MappedRender": "aovs.mapped_render",
     "MssplError": "errors",
-    "PairCheck": "jobs.pair_check",
+    "PairCheck": "jobs.fitting",
     "Render": "exr.render",
     "Session": "model.session",
     "Shot": "jobs.sequence",
-    "ShotCheck": "jobs.shot_check",
+    "ShotCheck": "jobs.fitting",
     "ShotReport": "jobs.shot_report",
     "TemporalOptions": "jobs.plan",
     "Window": "exr.render",
     "WriteOptions": "exr.write_options",
-    "check_files": "jobs.pair_check",
-    "check_shot": "jobs.shot_check",
+    "check_files": "jobs.fitting",
+    "check_shot": "jobs.fitting",
     "find_model": "model.catalogue",
     "find_shot": "jobs.sequence",
     "fuse": "fusion.fuse",

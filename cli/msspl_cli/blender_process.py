@@ -32,14 +32,7 @@ _POSIX = os.name == "posix"
 
 
 def find_blender(named: str | None) -> str:
-    """Find Blender, or a Python that has bpy.
-
-    Args:
-        named: a program or its name. None: the one that MSSPL_BLENDER names, or else ``blender`` on the path.
-
-    Raises:
-        InputError: there is no such program.
-    """
+    """Find Blender, or a Python that has bpy: as named, or by MSSPL_BLENDER, or ``blender`` on the path."""
     for where, name in (("--blender", named), ("MSSPL_BLENDER", os.environ.get("MSSPL_BLENDER")), ("", "blender")):
         program = shutil.which(os.path.expanduser(name)) if name else None
         if program is not None:
@@ -62,8 +55,6 @@ def render_frames(
     """Let Blender render the frames of a job, and fuse each in this process, where the model stays loaded.
 
     Args:
-        program: Blender, or a Python that has bpy.
-        scene: a .blend.
         job: the frames and the settings that headless.py reads.
         folder: the folder of the results. The renders lie in it, so that a render that is kept is only renamed.
         on_event: called with each event: a step that begins, the fraction of samples that is done, the report of a
@@ -112,11 +103,6 @@ def run_blender(
     arguments: Sequence[str], fuse: Callable[[Path, Path], None], *, verbose: bool = False
 ) -> Iterator[dict[str, Any]]:
     """Run the add-on's headless.py. Leaving the loop ends Blender and every process that it started.
-
-    Args:
-        arguments: of :func:`command`.
-        fuse: see :func:`render_frames`.
-        verbose: pass on the messages of Blender.
 
     Yields:
         The events that headless.py prints, and ``{"samples": fraction}`` for each line about samples.

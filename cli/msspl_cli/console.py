@@ -52,13 +52,7 @@ def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 
 
 
 def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str]) -> None:
-    """Print which layer each feature is read from.
-
-    Args:
-        rows: of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` or
-            :meth:`oiio_msspl.jobs.report.FrameReport.aovs`.
-        notes: sentences printed below.
-    """
+    """Print the rows of :meth:`.MappedRender.table`: which layer each feature is read from. Notes follow below."""
     from oiio_msspl.aovs.mapped_render import origin
 
     table([(row["feature"], origin(row)) for row in rows])

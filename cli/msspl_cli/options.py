@@ -154,11 +154,7 @@ def make_inputs(
     colourspace: str | None = None,
     sums: list[str] | None = None,
 ) -> InputOptions:
-    """Return the options that describe the input files. ``--map`` wins over ``--map-file``.
-
-    Raises:
-        InputError: a mapping can't be read.
-    """
+    """Return the options that describe the input files. ``--map`` wins over ``--map-file``."""
     from oiio_msspl.aovs.mapping import parse_map_options, read_map_file
     from oiio_msspl.jobs.inputs import InputOptions
 
@@ -168,22 +164,14 @@ def make_inputs(
 
 
 def low_and_high(renders: list[Path]) -> tuple[Path | None, Path]:
-    """Return the paths of the LRHS and of the HRLS; None and that of the only render.
-
-    Raises:
-        InputError: there are more than two.
-    """
+    """Return the paths of the LRHS and of the HRLS; None and that of the only render. More than two are refused."""
     if len(renders) > 2:
         raise InputError(f"{renders[2]}: is a third render; give one, or two of the same frame")
     return renders[0] if len(renders) == 2 else None, renders[-1]
 
 
 def choose_model(model: str, quality: str | None) -> str:
-    """Return the model that ``--model`` and ``--quality`` name.
-
-    Raises:
-        InputError: both are given, or there is no such quality.
-    """
+    """Return the model that ``--model`` or ``--quality`` names. Raise InputError if both do."""
     from oiio_msspl.model.catalogue import AUTO, QUALITIES
 
     if quality is None:
@@ -207,11 +195,7 @@ def make_write_options(
     trust: str = "on",
     trust_layer: bool = False,
 ) -> WriteOptions:
-    """Return the options that describe the result.
-
-    Raises:
-        InputError: an unknown layout, compression or value of ``--trust``.
-    """
+    """Return the options that describe the result."""
     from oiio_msspl.exr.write_options import WriteOptions
 
     pixel_type = None if half is None else "half" if half else "float"

@@ -56,10 +56,15 @@ class ShotPrinter:
     def __call__(self, result: FrameResult, report: ShotReport) -> None:
         """Print the progress, the errors and the warnings of a frame that ended."""
         self._report = report
+        done, count = len(report.results), len(report.shot.frames)
         if self._progress == "openjd":
-            _print_openjd(result, report)
+            console.say(f"openjd_progress: {100 * done / count:.1f}")
+            console.say(f"openjd_status: frame {result.frame} {result.status}, {done} of {count} done")
+            if result.message:
+                console.say(f"openjd_fail: frame {result.frame}: {result.message}")
         elif self._progress == "json":
-            _print_json(result, report)
+            line = {name: getattr(result, name) for name in ("frame", "status", "message", "warnings", "output")}
+            print(json.dumps({**line, "done": done, "count": count}), flush=True)
         if result.message:
             self._print_once("error", result.frame, result.message)
         for warning in () if self._quiet else result.warnings:
@@ -67,7 +72,6 @@ class ShotPrinter:
         if self._verbose:
             times = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in result.seconds.items())
             console.say(f"frame {result.frame}: {result.status}" + (f" ({times})" if times else ""), error=True)
-        done, count = len(report.results), len(report.shot.frames)
         bad = sum(bool(ended.message) for ended in report.results.values())
         self._bar.update(f"{done} of {count} frames" + (f", {bad} not fused" if bad else ""), done, count)
 
@@ -90,21 +94,6 @@ class ShotPrinter:
 def _without_numbers(text: str) -> str:
     """Replace the numbers of a sentence, which differ between the frames of a shot."""
     return re.sub(r"-?[\d.]+", "0", text)
-
-
-def _print_openjd(result: FrameResult, report: ShotReport) -> None:
-    """Print lines that an Open Job Description worker understands."""
-    done, count = len(report.results), len(report.shot.frames)
-    console.say(f"openjd_progress: {100 * done / count:.1f}")
-    console.say(f"openjd_status: frame {result.frame} {result.status}, {done} of {count} done")
-    if result.message:
-        console.say(f"openjd_fail: frame {result.frame}: {result.message}")
-
-
-def _print_json(result: FrameResult, report: ShotReport) -> None:
-    """Print a frame as a line of JSON."""
-    line = {name: getattr(result, name) for name in ("frame", "status", "message", "warnings", "output")}
-    print(json.dumps({**line, "done": len(report.results), "count": len(report.shot.frames)}), flush=True)
 
 
 def _print_table(report: ShotReport) -> None:

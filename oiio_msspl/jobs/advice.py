@@ -37,20 +37,6 @@ def advise(lr: MappedRender, hr: MappedRender, spread: bool | None, *, in_shot: 
     scale = align(lr, hr).scale
     if any(name.startswith("msspl/") for name in hr.metadata):
         return []  # it is fused already
-    advice = [*_layers(hr, in_shot), *_filter(spread)]
-    if lr is hr:
-        advice.append(_second_seed())
-    if spread:
-        return advice  # sizes were compared with independent noise
-    if lr is hr:
-        advice.append(_no_lrhs("a low-resolution render would not pay here: one render is"))
-    elif scale != ONE_SIZE:
-        advice += _samples(lr.spp, hr.spp, scale)
-        advice.append(_no_lrhs("without the low-resolution render, one render with all samples would be"))
-    return advice
-
-
-def _layers(hr: MappedRender, in_shot: bool) -> list[Finding]:
     advice = []
     if ALBEDO not in hr.features:
         text = "render an albedo, or name its layer with --map albedo=LAYER: without it textures blur. It costs a layer"
@@ -58,36 +44,40 @@ def _layers(hr: MappedRender, in_shot: bool) -> list[Finding]:
     if in_shot and not hr.motion.fields:
         text = f"render motion vectors: averaging with neighbouring frames adds {NEIGHBOURS:.1f} dB. They cost a layer"
         advice.append(Finding("add_motion", f"{text}, and no samples"))
+    if spread:
+        oidn, ours = SPREAD_NOISE
+        text = (
+            "render with a box filter of one pixel: it costs nothing, and the result is a little sharper. With this "
+            f"filter, the noise is removed all the same ({ours:.1f} dB at 2 spp, where OIDN reaches {oidn:.1f})"
+        )
+        advice.append(Finding("box_filter", text))
+    if lr is hr:
+        without, with_both = BOTH_SHOW
+        text = (
+            "render half of the samples with another seed, as a second file: it costs no samples, but the scene is "
+            "loaded twice. Detail that no AOV shows, such as screens and thin shadows, is kept where two renders show "
+            f"it (a lit display at 64 and 16 spp: {with_both} dB, and {without} by the network alone)"
+        )
+        advice.append(Finding("second_seed", text))
+    if not spread and (lr is hr or scale != ONE_SIZE):  # sizes were compared with independent noise
+        what = "without the low-resolution render, one render with all samples would be"
+        if lr is hr:
+            what = "a low-resolution render would not pay here: one render is"
+        least, most = ONE_OVER_TWO_SIZES
+        text = f"{what} {least:.1f} to {most:.1f} dB more accurate than two sizes with the same samples"
+        advice += [
+            *_samples(lr, hr, scale),
+            Finding("no_lrhs", f"{text}. Two sizes pay where the small render exists anyway"),
+        ]
     return advice
 
 
-def _filter(spread: bool | None) -> list[Finding]:
-    if not spread:
-        return []
-    oidn, ours = SPREAD_NOISE
-    text = (
-        "render with a box filter of one pixel: it costs nothing, and the result is a little sharper. With this "
-        f"filter, the noise is removed all the same ({ours:.1f} dB at 2 spp, where OIDN reaches {oidn:.1f})"
-    )
-    return [Finding("box_filter", text)]
-
-
-def _second_seed() -> Finding:
-    without, with_both = BOTH_SHOW
-    text = (
-        "render half of the samples with another seed, as a second file: it costs no samples, but the scene is loaded "
-        "twice. Detail that no AOV shows, such as screens and thin shadows, is kept where two renders show it (a lit "
-        f"display at 64 and 16 spp: {with_both} dB, and {without} by the network alone)"
-    )
-    return Finding("second_seed", text)
-
-
-def _samples(lr_spp: float | None, hr_spp: float | None, scale: int) -> list[Finding]:
+def _samples(lr: MappedRender, hr: MappedRender, scale: int) -> list[Finding]:
     """Advise to move samples to the HRLS, if it has enough to gain from more."""
-    if lr_spp is None or hr_spp is None or hr_spp < MANY_SPP:
+    if lr is hr or lr.spp is None or hr.spp is None or hr.spp < MANY_SPP:
         return []
-    small = lr_spp / scale**2
-    total = small + hr_spp
+    small = lr.spp / scale**2
+    total = small + hr.spp
     if small <= LARGEST_SHARE * total:
         return []
     text = (
@@ -96,9 +86,3 @@ def _samples(lr_spp: float | None, hr_spp: float | None, scale: int) -> list[Fin
         "spp in all"
     )
     return [Finding("more_hr_samples", text)]
-
-
-def _no_lrhs(what: str) -> Finding:
-    least, most = ONE_OVER_TWO_SIZES
-    text = f"{what} {least:.1f} to {most:.1f} dB more accurate than two sizes with the same samples"
-    return Finding("no_lrhs", f"{text}. Two sizes pay where the small render exists anyway")

@@ -23,7 +23,7 @@ from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.tiling import result_bytes
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.inputs import map_pair
-from oiio_msspl.jobs.memory import memory_to_average, require_frame_memory
+from oiio_msspl.jobs.memory import check_frame_memory, memory_to_average
 from oiio_msspl.jobs.plan import AUTO, ShotPlan, TemporalOptions, ViewPlan, reach_of
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
@@ -95,19 +95,16 @@ class RenderedShot:
         #: What the names of a frame's renders end with if they are kept.
         self.suffixes = suffixes(renders, scale)
         self._required = options.frames != AUTO
-        #: Number of the frame that an error is about.
-        self._at_work = 0
-        #: Renders on the disk, by frame number.
-        self._renders: dict[int, FrameFiles] = {}
-        #: Warnings about the frames that are written.
-        self._warnings: dict[Path, list[Finding]] = {}
+        self._at_work = 0  # number of the frame that an error is about
+        self._renders: dict[int, FrameFiles] = {}  # on the disk, by frame number
+        self._warnings: dict[Path, list[Finding]] = {}  # about the frames that are written
         frames = {files.number: files for files in shot}
         # Every neighbour must be rendered, so `best` takes no more of them than other models.
         count = options.count()
         length = f"{count} frame{'s' if count > 1 else ''}"
-        text = f"with {length} before and after each, along the motion vectors of Cycles"
+        text = f"with {length} before and after each, along the motion vectors of Cycles" if count else ""
         # How Cycles stores vectors is read from the first frame.
-        self._plan = ShotPlan(frames, {None: ViewPlan(reach_of(count, VECTORS))}, text if count else "")
+        self._plan = ShotPlan(frames, {None: ViewPlan(reach_of(count, VECTORS))}, text)
         if count and not any(number + 1 in frames for number in frames):
             self.fuse_alone("no two frames follow each other")
         self._run: ShotRun | None = None
@@ -130,11 +127,7 @@ class RenderedShot:
         return self._plan.text
 
     def fuse_alone(self, reason: str) -> None:
-        """Fuse every frame by itself. No frame has been fused yet.
-
-        Raises:
-            InputError: the user has asked for neighbours.
-        """
+        """Fuse every frame by itself, before any is fused. Raise InputError if the user has asked for neighbours."""
         if self._required:
             raise InputError(f"--temporal {self._plan.count}: {reason}")
         self._plan = ShotPlan(text=f"frame by frame: {reason}")
@@ -152,24 +145,21 @@ class RenderedShot:
         """
         write = self._settings.write
         (width, height), scale = size, self._scale
-        session = self._settings.load(scale)
         window, grid = Window(0, 0, width, height), Window(0, 0, -(-width // scale), -(-height // scale))
         alignment = Alignment(scale, grid, grid, window)
-        reach = self._plan.views[None].reach
         held = result_bytes(alignment, error=write.error_layer)
-        held += memory_to_average(reach, window, USUAL_CHANNELS, scale)
+        held += sum(memory_to_average(self._plan.views[None].reach, window, USUAL_CHANNELS, scale))
         written = pixel_bytes * width * height if write.layout == "multilayer" else 0
-        require_frame_memory(alignment, session, write, self._settings.max_memory, layers=written, held=held)
+        most, session = self._settings.max_memory, self._settings.load(scale)
+        check_frame_memory(alignment, session, write, most, written, held)
         if layers is None or write.passes in ((), ("none",)):
             return
         sets = _cycles_sets(layers)
         if not any(group.matches(pattern) for group in sets for pattern in write.passes):
-            listed = (
-                ", ".join(f"'{group.name}'" for group in sets) or "none (turn on light groups, or pass --components)"
-            )
-            raise InputError(
-                f"--passes {', '.join(write.passes)}: the scene renders no such set of layers; it has {listed}"
-            )
+            listed = ", ".join(f"'{group.name}'" for group in sets)
+            listed = listed or "none (turn on light groups, or pass --components)"
+            said = f"--passes {', '.join(write.passes)}: the scene renders no such set of layers"
+            raise InputError(f"{said}; it has {listed}")
 
     def fuse(self, lr: Path, hr: Path) -> None:
         """Fuse the next frame of ``order``, and write each frame that has all its neighbours now.
@@ -187,11 +177,23 @@ class RenderedShot:
         files = replace(next(self._next), lr=lr, hr=hr)
         self._at_work, is_first = files.number, self._run is None
         with self._keep_if_it_fails(files):
-            run = self._prepare(files)
+            run = self._run = self._run or self._start(files)
+            if family_of(run.settings.model):  # all frames get the model that suits the first pair with noise
+                family, told = choose_model(*map_pair(*files.pair, run.settings.inputs), run.settings.model)
+                if told:
+                    run.settings = replace(run.settings, model=family)
         if is_first:
             run.existing.check_weights(frame for frame in self._shot if frame not in self._wanted)
         with self._keep_if_it_fails(files):
-            self._take(run, files)
+            views = run.read(files)
+            views[0].require()
+            self._renders[files.number] = files
+            for frame in run.take(views):
+                self._at_work = frame.number
+                first, last = (str(beside(frame.files.output, self.suffixes[index])) for index in (0, -1))
+                frame.report.sources = (first, last) if self._keep else ("a render that was not kept",) * 2
+                write_settled(frame, run.existing)
+                self._warnings[frame.files.output] = frame.report.warnings
         self._discard()
 
     @contextmanager
@@ -207,34 +209,10 @@ class RenderedShot:
                 said = f"frame {self._at_work}: {said}"
             raise (InputError if code == InputError.exit_code else MssplError)(said) from error
 
-    def _prepare(self, files: FrameFiles) -> ShotRun:
-        """Return the run of the shot, with the model that suits the first pair."""
-        run = self._run = self._run or self._start(files)
-        assert files.lr is not None and files.hr is not None
-        if family_of(run.settings.model):  # all frames get the model that suits the first pair with noise
-            family, told = choose_model(*map_pair(files.lr, files.hr, run.settings.inputs), run.settings.model)
-            if told:
-                run.settings = replace(run.settings, model=family)
-        return run
-
-    def _take(self, run: ShotRun, files: FrameFiles) -> None:
-        """Fuse a frame that is rendered, and write each frame that has all its neighbours now."""
-        views = run.read(files)
-        views[0].require()
-        self._renders[files.number] = files
-        for frame in run.take(views):
-            self._at_work = frame.number
-            lr, hr = (str(beside(frame.files.output, self.suffixes[index])) for index in (0, -1))
-            frame.report.sources = (lr, hr) if self._keep else ("a render that was not kept",) * 2
-            write_settled(frame, run.existing)
-            self._warnings[frame.files.output] = frame.report.warnings
-
     def _start(self, files: FrameFiles) -> ShotRun:
-        """Start the shot with its first frame."""
         plan = self._plan
         if plan.count:
-            assert files.lr is not None and files.hr is not None
-            _, hr = map_pair(files.lr, files.hr, self._settings.inputs)
+            _, hr = map_pair(*files.pair, self._settings.inputs)
             # The format need not be verified: Blender is known, and motion blur is off.
             motion = MotionSource(VECTORS, plan.text, hr.motion.fields)
             plan = replace(plan, views={None: ViewPlan(plan.views[None].reach, motion)})
@@ -247,11 +225,7 @@ class RenderedShot:
     def _keep_failed(self, files: FrameFiles, said: str) -> str:
         """Keep the renders of a frame that can't be fused. The rest of the temporary files is deleted.
 
-        Args:
-            said: the error. It may name the renders.
-
-        Returns:
-            The error, with the names of the files that are kept.
+        Return the error ``said``, which may name the renders, with the names of the files that are kept.
         """
         kept = self._places(files)
         if not all(path.exists() for path in kept):  # Blender wrote none, and the error says so
@@ -270,8 +244,7 @@ class RenderedShot:
 
     def _places(self, files: FrameFiles) -> dict[Path, Path]:
         """Return where each render of a frame is kept, by its temporary file. An only render is there once."""
-        assert files.lr is not None and files.hr is not None
-        paths = dict.fromkeys((files.lr, files.hr))
+        paths = dict.fromkeys(files.pair)
         return {path: beside(files.output, name) for path, name in zip(paths, self.suffixes, strict=True)}
 
     def waits(self, output: Path) -> bool:

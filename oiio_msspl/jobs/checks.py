@@ -8,32 +8,22 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from oiio_msspl.aovs.features import ALBEDO, NORMAL
-from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.renderers import file_names
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_folder, check_separate, make_folder
-from oiio_msspl.exr.write_options import (
-    ALBEDO_LAYER,
-    ERROR_LAYER,
-    FRAMES_LAYER,
-    NORMAL_LAYER,
-    TRUST_LAYER,
-    WriteOptions,
-)
-from oiio_msspl.exr.writer import check_layout
+from oiio_msspl.exr.atomic import check_folder, check_separate
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.fusion.fuse import check_model
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.jobs.inputs import InputOptions, map_pair
+from oiio_msspl.jobs.fitting import check_files
+from oiio_msspl.jobs.inputs import InputOptions, find_views, map_pair
 from oiio_msspl.jobs.memory import check_frame_memory
-from oiio_msspl.jobs.pair_check import check_files
-from oiio_msspl.jobs.passes import check_passes, sets_to_fuse
+from oiio_msspl.jobs.passes import check_layers, sets_to_fuse
 from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
 from oiio_msspl.jobs.sequence import FrameFiles, Shot, frame_in_name
 from oiio_msspl.jobs.settings import Settings, choose_model
-from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import family_of, find_model, for_spread_noise
 from oiio_msspl.model.contract import Contract
 
@@ -48,13 +38,13 @@ def check_output(shot: Shot, inputs: InputOptions, model: str | None, more_targe
             sequence.
     """
     folder = shot.output.folder
-    check_mapped_sequences(shot.frames, inputs)
+    _check_mapped_sequences(shot.frames, inputs)
     check_no_file(folder)
     check_folder(shot.output.path(0) if folder.exists() else folder)
     check_no_input(shot, inputs, model, more_targets)
 
 
-def check_mapped_sequences(frames: Sequence[FrameFiles], inputs: InputOptions) -> None:
+def _check_mapped_sequences(frames: Sequence[FrameFiles], inputs: InputOptions) -> None:
     """Raise InputError if a mapping names one file of a sequence for all frames of a shot."""
     numbers = {frame.number for frame in frames}
     for name in file_names(inputs.mapping):
@@ -66,16 +56,6 @@ def check_mapped_sequences(frames: Sequence[FrameFiles], inputs: InputOptions) -
             raise InputError(
                 f"{path}: is one frame of a sequence, and would be read for all frames of the shot; write {pattern}"
             )
-
-
-def make_output(shot: Shot) -> None:
-    """Create the output folder if it is missing.
-
-    Raises:
-        InputError: it can't be created.
-    """
-    make_folder(shot.output.folder)
-    check_folder(shot.output.path(0))
 
 
 def check_no_file(folder: Path) -> None:
@@ -135,22 +115,6 @@ def check_no_input(
     check_separate(pairs.union(*others), [*(path for frame in shot.frames for path in frame.targets), *more_targets])
 
 
-def check_written_layers(hr: MappedRender, write: WriteOptions) -> None:
-    """Check by the headers that the layers that are asked for exist, and that one file can hold them all.
-
-    Raises:
-        InputError: a pattern of ``write`` matches nothing, or the layout can't hold the layers.
-    """
-    wanted = {
-        ERROR_LAYER: write.error_layer,
-        FRAMES_LAYER: write.frames_layer,
-        TRUST_LAYER: write.trust_layer,
-        ALBEDO_LAYER: write.data_passes and ALBEDO in hr.features,
-        NORMAL_LAYER: write.data_passes and NORMAL in hr.features,
-    }
-    check_layout(hr.file, hr.beauty_channels, write, [name for name, is_added in wanted.items() if is_added])
-
-
 def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list[str]:
     """Check the first frame that has both renders, before a farm or cluster is asked to fuse all of them.
 
@@ -177,7 +141,7 @@ def look_ahead(frames: Sequence[FrameFiles], settings: Settings) -> dict[str, An
         try:
             lr, hr = map_pair(frame.lr, frame.hr, settings.inputs)
             scale = align(lr, hr).scale
-            views = [hr, *find_other_views(lr, hr, settings.inputs, settings.write).hrls]
+            views = [view.hr for view in find_views(lr, hr, settings.inputs, settings.write)[0]]
             sets = {
                 additive.name: additive.layer_names for view in views for additive in sets_to_fuse(view, settings.write)
             }
@@ -202,7 +166,7 @@ def check_wanted_outputs(
             can't hold the layers, the model is for another scale or does not make a layer, or ``max_memory`` bytes are
             too few.
     """
-    check_mapped_sequences(frames, inputs)
+    _check_mapped_sequences(frames, inputs)
     problem: InputError | None = None
     for frame in frames:
         if frame.lr is None or frame.hr is None:
@@ -210,16 +174,16 @@ def check_wanted_outputs(
         try:
             lr, hr = map_pair(frame.lr, frame.hr, inputs)
             scale = align(lr, hr).scale
-            others = find_other_views(lr, hr, inputs, write)
+            views, _ = find_views(lr, hr, inputs, write)
         except InputError as error:
             if all(path.exists() for path in inputs.files(frame.hr, None)):  # others may exist on the workers only
                 problem = problem or error
             continue
-        check_written_layers(hr, write)
-        check_passes([hr, *others.hrls], write)
+        check_layers([view.hr for view in views], write)
         session = Settings(write=write, model=model).session(scale)
         check_model(session, scale, error=write.error_layer)
-        check_frame_memory(lr, hr, session, write, max_memory)
+        layers = bytes_held(hr.file, hr.beauty_channels, write)
+        check_frame_memory(align(lr, hr), session, write, max_memory, layers)
         return
     if problem is not None:
         raise problem

@@ -18,6 +18,7 @@ from oiio_msspl.jobs.report import WEIGHTS_ATTRIBUTE
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, older_than, result_of
+from oiio_msspl.jobs.timeline import neighbours
 from oiio_msspl.model.catalogue import model_files
 from oiio_msspl.model.contract import ONE_SIZE, SCALES
 from oiio_msspl.model.digests import as_text, digests
@@ -58,8 +59,9 @@ class ExistingResults:
         if files.lr is None or files.hr is None or not files.output.exists():
             return []
         written = files.output.stat().st_mtime
-        renders = [files.lr, files.hr, *self.plan.files_beside(files.hr)]
-        paths = files_by_name(renders, files.hr, self.settings.inputs, self.settings.model)
+        beside = neighbours(files.number, self.plan.count, self.plan.frames)
+        renders = [path for frame in (files, *map(self.plan.frames.__getitem__, beside)) for path in frame.pair]
+        paths = files_by_name(renders, self.settings.inputs, self.settings.model)
         return [path for path in paths if path.is_file() and path.stat().st_mtime > written]
 
     def dated_in_future(self, frames: Sequence[FrameFiles]) -> Path | None:

@@ -12,6 +12,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, remove_leftovers
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
@@ -76,16 +77,16 @@ def fuse_files(
     if is_sequence(output):
         raise InputError(f"{output}: is a pattern, but LR and HR are single files; name one file")
     max_memory = bytes_of(max_memory)
-    if preview_path is True:
-        preview_path = output.with_suffix(".png")
+    preview = None
     if preview_path:
-        preview_path = check_target(preview_path, overwrite=overwrite)
-        if preview_path.suffix.lower() != ".png":
-            raise InputError(f"{preview_path}: the preview is a PNG; name it .png")
+        preview = check_target(
+            output.with_suffix(".png") if preview_path is True else preview_path, overwrite=overwrite
+        )
+        if preview.suffix.lower() != ".png":
+            raise InputError(f"{preview}: the preview is a PNG; name it .png")
         if view_transform is not None:
             check_view(view_transform)
     settings = Settings(inputs, write, model, device, threads, max_memory, view_transform, overwrite, strict=strict)
-    preview = Path(preview_path) if preview_path else None
     files = FrameFiles(0, *both_paths(lr_path, hr_path), output, preview)
     if progress is not None:
         progress(0, WHOLE)
@@ -96,7 +97,8 @@ def fuse_files(
     remove_leftovers(files.targets)
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     alignment = align(frame.lr, frame.hr)
-    if memory_to_write(alignment, frame.hr, write) <= max_memory:
+    layers = bytes_held(frame.hr.file, frame.hr.beauty_channels, write)
+    if memory_to_write(alignment, write, layers) <= max_memory:
         run.settings = replace(settings, model=choose_model(frame.lr, frame.hr, model, frame.read_if_small)[0])
     run.settings.session(alignment.scale)
     opened = time.perf_counter()

@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame of a shot on its way from its files to its result, one record for each view."""
+"""Reads a frame of a shot, and keeps what is known of it on its way to its result, one record for each view.
+
+Its pair is opened, the layers of each view are mapped, and pixels are read if there is room for them.
+"""
 
 from __future__ import annotations
 
+import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError, explain
+from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
@@ -18,13 +25,16 @@ from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.source import MotionFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
-from oiio_msspl.fusion.passes.layers import is_large, layer_names, lrhs_names, with_light
+from oiio_msspl.fusion.passes.layers import is_large, layer_names, lrhs_names, pass_features, with_light
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array, Mask, kept
-from oiio_msspl.jobs.memory import ViewMemory
-from oiio_msspl.jobs.passes import Progress, sets_to_fuse
-from oiio_msspl.jobs.plan import ViewPlan
+from oiio_msspl.jobs.inputs import MappedPair, files_by_name, find_views, map_pair
+from oiio_msspl.jobs.memory import ViewMemory, light_features
+from oiio_msspl.jobs.passes import Progress, check_layers, sets_to_fuse
+from oiio_msspl.jobs.plan import ShotPlan, ViewPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key
 from oiio_msspl.model.session import Session
 
@@ -139,8 +149,14 @@ class ShotFrame:
         if self.error is not None:
             raise self.error
 
-    def require_state(self, state: State) -> None:
-        """Raise why this frame has not come so far that a neighbour can be averaged with it.
+    @property
+    def result(self) -> FusedFrame:
+        """``fused``, which is there."""
+        assert self.fused is not None
+        return self.fused
+
+    def require_state(self, state: State) -> ShotFrame:
+        """Return this frame, or raise why it has not come so far that a neighbour can be averaged with it.
 
         Raises:
             InputError: its files can't be used, so it is left out in every run.
@@ -148,7 +164,7 @@ class ShotFrame:
                 pixels than in another run.
         """
         if self.state >= state:
-            return
+            return self
         assert self.error is not None
         if isinstance(self.error, InputError):
             raise self.error
@@ -162,9 +178,10 @@ class ShotFrame:
         """
         if self.renders.hr is self.stored[1] and not is_large(self.hr):
             sets = sets_to_fuse(self.hr, self.write)
-            high = _loaded(with_light(self.hr, layer_names(sets)))
-            low = high if self.lr is self.hr else _loaded(with_light(self.lr, lrhs_names(self.lr, sets)))
-            self.renders = RenderPair(low, high)
+            high = with_light(self.hr, layer_names(sets))
+            pair = [high] if self.lr is self.hr else [with_light(self.lr, lrhs_names(self.lr, sets)), high]
+            loaded = [render.load([*render.features, "alpha"]) for render in pair]
+            self.renders = RenderPair(loaded[0], loaded[-1])
         return self.renders
 
     def motion_frame(self) -> MotionFrame:
@@ -174,15 +191,10 @@ class ShotFrame:
 
     def keep_result(self) -> None:
         """Let the fused picture wait for its neighbours, in a temporary file if it is large."""
-        fused = self.fused
-        assert fused is not None
+        fused = self.result
         fused.rgb = kept(fused.rgb)
         fused.alpha = None if fused.alpha is None else kept(fused.alpha)
         fused.error = None if fused.error is None else kept(fused.error)
-
-    def forget_pixels(self) -> None:
-        """Give up the pixels of the renders. The files can still be read."""
-        self.renders = RenderPair(*self.stored)
 
     def forget_all_but_picture(self) -> None:
         """Give up what only this frame's own result needs."""
@@ -191,6 +203,104 @@ class ShotFrame:
             self.fused = replace(self.fused, clean_aovs={}, error=None, frames=None)
 
 
-def _loaded(render: MappedRender) -> Render:
-    """Read the features of a render, with its alpha."""
-    return render.load([*render.features, "alpha"])
+def read_frame(files: FrameFiles, settings: Settings, plan: ShotPlan, *, only_frame: bool = False) -> list[ShotFrame]:
+    """Read a frame whose renders exist.
+
+    Args:
+        only_frame: no other frame needs memory. Pixels are then read from the files as the network needs them.
+
+    Returns:
+        A record for each view of the plan, the first view in front. One that can't be used has an ``error``. Views
+        that the plan lacks are the ``others`` of the first one.
+    """
+    start = time.perf_counter()
+    frames = [ShotFrame(files, view, own) for view, own in plan.views.items()]
+    first = frames[0]
+    with first.attempt():
+        present = _open(frames, settings)
+        if not only_frame:
+            _budget(present, settings, missing=len(frames) - len(present))
+        for frame in present:
+            with frame.attempt():
+                if not only_frame:
+                    _read_pixels(frame)
+                frame.state = State.READ
+        first.seconds["read"] = time.perf_counter() - start
+    for frame in frames[1:]:
+        if frame.state < State.READ and frame.error is None:
+            frame.error = first.error or NoSuchView(f"it has no pair for {name_of(frame.view or '')}")
+    return frames
+
+
+def _open(frames: Sequence[ShotFrame], settings: Settings) -> list[ShotFrame]:
+    """Open the pair, map it for each view, and check all that headers tell. Return the views that it has."""
+    first, inputs, write = frames[0], settings.inputs, settings.write
+    files = first.files
+    lr, hr = map_pair(*files.pair, inputs)
+    views, first.passed_on = find_views(lr, hr, inputs, write)
+    read = files_by_name(files.pair, inputs, settings.model)
+    check_separate({*read, *lr.file.siblings, *hr.file.siblings}, files.targets)
+    align(lr, hr)  # refuses the pair before its pixels are read
+    check_layers([view.hr for view in views], write)
+    pairs: dict[str | None, MappedPair] = {view.hr.view: view for view in views[1:]}
+    pairs[None] = views[0]
+    present = [frame for frame in frames if frame.view in pairs]
+    planned = {frame.view for frame in frames}
+    first.others = [ShotFrame(files, name, state=State.READ) for name in pairs if name not in planned]
+    for frame in (*present, *first.others):
+        _set_pair(frame, *pairs[frame.view], settings)
+    return present
+
+
+def _set_pair(frame: ShotFrame, lr: MappedRender, hr: MappedRender, settings: Settings) -> None:
+    frame.lr, frame.hr, frame.write = lr, hr, settings.write
+    if frame.view is not None:  # layers about the fused picture are those of the first view
+        frame.write = replace(settings.write, error_layer=False, trust_layer=False, data_passes=False, pixel_type=None)
+    sets = sets_to_fuse(hr, frame.write) if frame.plan.reach.renders else []
+    frame.stored = pass_features(lr, hr, sets) if sets else (lr, hr)
+    frame.renders = RenderPair(*frame.stored)
+
+
+def _budget(frames: Sequence[ShotFrame], settings: Settings, *, missing: int) -> None:
+    """Budget the memory of each view that is there. Of those that are ``missing``, other frames may wait."""
+    memories = []
+    for frame in frames:
+        low, high = frame.stored
+        try:  # a file may have many more features than the model reads, and decoding them all is slow
+            features = features_read(settings.load(align(low, high).scale))
+        except InputError:  # the model can't be loaded, which ends the job when it is needed
+            features = [*HRLS_FEATURES, "alpha"]
+        features += light_features(high)
+        most = settings.max_memory
+        memories.append(ViewMemory(low, high, features, frame.plan, frame.write.error_layer, most))
+    waiting = [memory.waiting for memory in memories]
+    total = sum(waiting) + missing * max(waiting)
+    for frame, memory, own in zip(frames, memories, waiting, strict=True):
+        frame.memory = replace(memory, other_views=total - own)
+
+
+def features_read(session: Session) -> list[str]:
+    """Return the features that a model reads of either render, and those that tell what a pixel shows."""
+    return list(dict.fromkeys([*session.contract.hrls, *session.contract.lrhs, ALBEDO, NORMAL, "alpha"]))
+
+
+def _read_pixels(frame: ShotFrame) -> None:
+    """Read the pixels of a view if the frames that live fit into memory beside a tile."""
+    start = time.perf_counter()
+    memory = frame.memory
+    assert memory is not None
+    if memory.plan.reach.frames:
+        # A damaged frame is left out by its neighbours, whether its pixels and vectors wait in memory or not.
+        if not memory.fits:
+            memory.hr.check_pixels(memory.motion_channels, memory.features)
+            memory.lr.check_pixels((), memory.features)
+        elif memory.motion_channels and not memory.vectors_ahead:
+            memory.hr.check_pixels(memory.motion_channels, ())
+    if memory.fits:
+        motion, channels = frame.plan.motion, memory.vectors_ahead
+        high, stored = memory.hr.load_with(channels, memory.features, on_disk=memory.on_disk)
+        vectors = motion.vectors_of(frame.hr, high, stored) if motion and channels else {}
+        frame.vectors = {direction: (kept(pixels), kept(mask)) for direction, (pixels, mask) in vectors.items()}
+        low = high if memory.lr is memory.hr else memory.lr.load(memory.features, on_disk=memory.on_disk)
+        frame.renders = RenderPair(low, high)
+    frame.seconds["read"] = time.perf_counter() - start

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens a pair of files, maps their layers, and names the files that a frame is made from."""
+"""Opens a pair of files, maps the layers of its views, and names the files that a frame is made from."""
 
 from __future__ import annotations
 
@@ -7,18 +7,24 @@ import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.candidates import mapped_files
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.renderers import aov_files
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.layers import layer_by_channel
 from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.colour import REC709, SPACES, ColourSpace, encoding_of, named_space, same_space, space_of
 from oiio_msspl.jobs.sequence import frame_in_name, is_sequence, parse_pattern
 
@@ -94,10 +100,6 @@ class MappedPair(NamedTuple):
 def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> MappedPair:
     """Open both files and map their layers to features.
 
-    Args:
-        lr_path, hr_path: the low-resolution and the high-resolution render.
-        inputs: mapping, view and spp.
-
     Returns:
         LRHS and HRLS. The LRHS has albedo and normal only if its file does. It is mapped for the view of the HRLS, or
         for its own first view if it lacks that one. One render, whose path is given as both, is both.
@@ -126,15 +128,10 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
 
 
 def both_paths(lr_path: str | Path | None, hr_path: str | Path) -> tuple[Path, Path]:
-    """Return the paths of the LRHS and of the HRLS; that of the only render as both, if ``lr_path`` is None.
-
-    Raises:
-        InputError: both are the same file.
-    """
-    if lr_path is None:
-        return Path(hr_path), Path(hr_path)
-    check_two_files(Path(lr_path), Path(hr_path))
-    return Path(lr_path), Path(hr_path)
+    """Return the paths of the LRHS and of the HRLS, which may not be one file; that of the only render as both."""
+    if lr_path is not None:
+        check_two_files(Path(lr_path), Path(hr_path))
+    return Path(hr_path if lr_path is None else lr_path), Path(hr_path)
 
 
 def check_two_files(lr_path: Path, hr_path: Path) -> None:
@@ -143,17 +140,8 @@ def check_two_files(lr_path: Path, hr_path: Path) -> None:
         raise InputError(f"{lr_path}: given twice; give it alone, or two renders with a noise seed of their own")
 
 
-def map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputOptions) -> MappedPair:
-    """Map a pair for another view or view layer.
-
-    Args:
-        lr, hr: the pair, mapped for its first view.
-        view: one of ``hr.other_views``.
-        inputs: mapping and spp. An entry that means a layer of the first view by its full name means that view alone.
-
-    Raises:
-        InputError: one of the files has no such view, or can't be used for it.
-    """
+def _map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputOptions) -> MappedPair:
+    """Map a pair, which is mapped for its first view, for one of ``hr.other_views``."""
     high = map_other_hrls(hr, view, inputs)
     if lr is hr:
         high.space = hr.space
@@ -166,7 +154,11 @@ def map_other_view(lr: MappedRender, hr: MappedRender, view: str, inputs: InputO
 
 
 def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedRender:
-    """Map the HRLS for another view, see :func:`map_other_view`."""
+    """Map the HRLS for another view. An entry that means a layer of the first view by its full name does not apply.
+
+    Raises:
+        InputError: the file has no such view, or can't be used for it.
+    """
     inputs = replace(inputs, view=view)
     try:
         render = _map_hrls(hr.file, inputs)
@@ -175,6 +167,54 @@ def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedR
         render = _map_hrls(hr.file, inputs)
     of_first_view = {name for name, formula in render.features.items() if hr.features.get(name) == formula}
     return _without_entries(render, inputs, of_first_view | _features_of_others(render))
+
+
+def find_views(
+    lr: MappedRender, hr: MappedRender, inputs: InputOptions, write: WriteOptions = WriteOptions()
+) -> tuple[list[MappedPair], tuple[str, ...]]:
+    """Find the views and view layers to fuse: those whose beauty or passes are written, or the one ``inputs`` names.
+
+    Returns:
+        The pair, mapped for each of them, the first one in front as it is given. And why other views are not fused, and
+        which beauties are not written, one sentence each.
+
+    Raises:
+        InputError: the first view does not fit together, or a pattern of ``write`` matches nothing.
+    """
+    if inputs.view is not None or not hr.other_views:
+        return [MappedPair(lr, hr)], ()
+    scale = align(lr, hr).scale
+    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
+    taken = _channels(hr)
+    views, passed_on = [MappedPair(lr, hr)], []
+    for label in hr.other_views:
+        try:
+            view = _map_other_view(lr, hr, label, inputs)
+            if (here := align(*view).scale) != scale:
+                raise InputError(f"the pair is x{here} here and x{scale} in {hr.view}")
+            if not taken.isdisjoint(view.hr.beauty_channels):
+                raise InputError("its beauty is a layer of another view")
+        except InputError as error:
+            passed_on.append(f"{name_of(label)} is passed on as it is: {error}")
+            continue
+        # A layer of no view layer may be found for several.
+        view.hr.additive_sets = [each for each in view.hr.additive_sets if taken.isdisjoint(_channels_of_set(each))]
+        made = view.hr.beauty_channels if write.passes == ("none",) else _channels(view.hr)
+        if not dropped.issuperset(made):
+            taken |= _channels(view.hr)
+            views.append(view)
+        if dropped.issuperset(view.hr.beauty_channels):
+            passed_on.append(f"the beauty of {name_of(label)} is left out, because --layers does not name it")
+    return views, tuple(passed_on)
+
+
+def _channels(hr: MappedRender) -> set[object]:
+    """Return the channels that may be fused for a view."""
+    return {*hr.beauty_channels}.union(*map(_channels_of_set, hr.additive_sets))
+
+
+def _channels_of_set(additive_set: AdditiveSet) -> set[object]:
+    return {channel for layer in additive_set.layers for channel in layer.channels}
 
 
 def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> ColourSpace:
@@ -203,10 +243,7 @@ def map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
     """Map the HRLS for the view that is asked for, or for its first one.
 
     If no view is asked for, an entry of the mapping that means a layer of another view layer by its full name does not
-    apply.
-
-    Raises:
-        InputError: see :func:`oiio_msspl.aovs.matching.map_render`.
+    apply. Errors are those of :func:`oiio_msspl.aovs.matching.map_render`.
     """
     render = _map_hrls(file, inputs)
     if inputs.view is None:
@@ -248,31 +285,15 @@ def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
     # the other layers, and an entry may name an EXR of the HRLS's size. Nor need it have the layers of the user's sums.
     features = [name for name in (ALBEDO, NORMAL) if name not in inputs.mapping]
     mapping = {name: layer for name, layer in inputs.mapping.items() if name == RGB}
-
-    def map_with(sums: Sequence[str]) -> MappedRender:
-        return map_render(file, mapping, view=inputs.view, spp=inputs.lr_spp, features=features, sums=sums)
-
-    if inputs.sums:
-        with contextlib.suppress(InputError):
-            return map_with(inputs.sums)
-    return map_with(())
+    mapped = partial(map_render, file, mapping, view=inputs.view, spp=inputs.lr_spp, features=features)
+    with contextlib.suppress(InputError):
+        return mapped(sums=inputs.sums)
+    return mapped()
 
 
-def files_by_name(renders: Sequence[Path], hr_path: Path, inputs: InputOptions, model: str | None) -> list[Path]:
-    """Return the files that a frame is made from without opening any, see :func:`files_read`.
+def files_by_name(renders: Sequence[Path], inputs: InputOptions, model: str | None) -> list[Path]:
+    """Return the files that a frame is made from, without opening any. Those of the mapping need not exist.
 
-    Args:
-        renders: the frame's pair, and the pairs of neighbours that it depends on.
-        hr_path: the frame's HRLS.
-        inputs, model: they name further files.
-
-    Returns:
-        The renders, in their order, and then the further files. Those of the mapping need not exist.
+    The first ones are ``renders``: the frame's pair, and the pairs of neighbours that it depends on.
     """
-    return [*renders, *sorted(inputs.files(hr_path, model).union(*map(aov_files, renders)))]
-
-
-def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:
-    """Return the files that a frame is made from: the pair, its siblings, the mapping's files and the user's model."""
-    paths = files_by_name([lr.file.path, hr.file.path], hr.file.path, inputs, model)
-    return {*paths, *lr.file.siblings, *hr.file.siblings}
+    return [*renders, *sorted(inputs.files(renders[1], model).union(*map(aov_files, renders)))]

@@ -15,7 +15,6 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.fusion.neighbours.average import memory_to_average_renders, memory_to_average_results
 from oiio_msspl.fusion.passes.layers import is_large
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
@@ -84,7 +83,7 @@ class ViewMemory:
     @cached_property
     def waiting(self) -> int:
         """The most memory that the frames of this view take while another view is fused."""
-        waiting = self._waiting_to_average + self._waiting_means
+        waiting = self._to_average[0] + self._waiting_means
         # Renders that are averaged wait in temporary files, because several views are.
         return waiting if self.plan.reach.renders else waiting + self._frames_alive * self._pair
 
@@ -122,15 +121,12 @@ class ViewMemory:
     @property
     def _averaging(self) -> int:
         """Memory of averaging, and of means that wait for their passes to be fused."""
-        channels = _channels(self.hr, self.features)
-        return memory_to_average(self.plan.reach, self.hr.data_window, channels, self._alignment.scale) + (
-            self._waiting_means
-        )
+        return sum(self._to_average) + self._waiting_means
 
-    @property
-    def _waiting_to_average(self) -> int:
+    @cached_property
+    def _to_average(self) -> tuple[int, int]:
         channels = _channels(self.hr, self.features)
-        return waiting_to_average(self.plan.reach, self.hr.data_window, channels, self._alignment.scale)
+        return memory_to_average(self.plan.reach, self.hr.data_window, channels, self._alignment.scale)
 
     @cached_property
     def _waiting_means(self) -> int:
@@ -142,8 +138,8 @@ class ViewMemory:
         return (self.plan.reach.results + 2) * bytes_of_pair
 
 
-def memory_to_average(reach: Reach, window: Window, channels: int, scale: int) -> int:
-    """Return what averaging takes, and what waits for it, without the pixels of renders that are in memory.
+def memory_to_average(reach: Reach, window: Window, channels: int, scale: int) -> tuple[int, int]:
+    """Return what waits to be averaged, without the pixels of renders that are in memory, and what averaging takes.
 
     Args:
         reach: neighbours of a frame.
@@ -152,15 +148,10 @@ def memory_to_average(reach: Reach, window: Window, channels: int, scale: int) -
         scale: of the pair.
     """
     if not reach.frames:
-        return 0
+        return 0, 0
     working = memory_to_average_results(window)
     if reach.renders:
         working = max(working, memory_to_average_renders(window, channels))
-    return waiting_to_average(reach, window, channels, scale) + working
-
-
-def waiting_to_average(reach: Reach, window: Window, channels: int, scale: int) -> int:
-    """Return the part of :func:`memory_to_average` that is held while other views are averaged."""
     pixels = window.width * window.height
     held = 2 * reach.results * FRAME_BYTES + 4 * reach.frames * VECTOR_BYTES
     if reach.renders:
@@ -168,46 +159,28 @@ def waiting_to_average(reach: Reach, window: Window, channels: int, scale: int) 
     if has_many_pixels(window.height, window.width):  # what is large waits in temporary files
         held = 0
     both = COLOUR_BYTES * (2 * reach.renders + 2) + LUMINANCE_BYTES * (2 * reach.results + 2)
-    return (held + RESULT_BYTES) * pixels + both * pixels // scale**2
+    return (held + RESULT_BYTES) * pixels + both * pixels // scale**2, working
 
 
-def memory_to_write(alignment: Alignment, hr: MappedRender, write: WriteOptions) -> int:
-    """Return the smallest ``max_memory`` with which the result can be written."""
-    held = bytes_held(hr.file, hr.beauty_channels, write)
-    return FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + held
+def memory_to_write(alignment: Alignment, write: WriteOptions, layers: int) -> int:
+    """Return what writing takes; ``layers`` are the bytes of other layers that it holds at once."""
+    return FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + layers
 
 
 def check_frame_memory(
-    lr: MappedRender, hr: MappedRender, session: Session, write: WriteOptions, max_memory: int, held: int = 0
+    alignment: Alignment, session: Session, write: WriteOptions, max_memory: int, layers: int, held: int = 0
 ) -> None:
-    """Refuse a pair that does not fit into memory, before its pixels are read.
+    """Refuse a pair that does not fit into memory, before its pixels are read or rendered.
 
     Args:
-        lr, hr, session, write: what is fused and how it is written.
-        max_memory: bytes that the process should stay below.
-        held: bytes of these that other frames need.
-
-    Raises:
-        InputError: it does not fit. The message says how much does.
-    """
-    layers = bytes_held(hr.file, hr.beauty_channels, write)
-    require_frame_memory(align(lr, hr), session, write, max_memory, layers=layers, held=held)
-
-
-def require_frame_memory(
-    alignment: Alignment, session: Session, write: WriteOptions, max_memory: int, *, layers: int, held: int
-) -> None:
-    """Refuse a pair that may not be rendered yet.
-
-    Args:
-        alignment, session, write, max_memory, held: as for :func:`check_frame_memory`.
-        layers: bytes of other layers that writing holds at once.
+        layers: bytes of other layers that writing holds at once, see :func:`oiio_msspl.exr.writer.bytes_held`.
+        held: bytes that other frames need.
 
     Raises:
         InputError: it does not fit. The message says how much does.
     """
     to_fuse = memory_to_fuse(alignment, session.contract, error=write.error_layer)
-    to_write = FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + layers
+    to_write = memory_to_write(alignment, write, layers)
     only_layout = write.layout == "multilayer" and to_fuse + held <= max_memory
     hint = ", or use --layout spec, which does not hold all layers at once" if only_layout else ""
     require_memory(max(to_fuse, to_write) + held, session.contract, max_memory, hint)

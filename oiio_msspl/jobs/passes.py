@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which passes of a frame are fused, and the steps in which a frame is fused, for progress."""
+"""Says which passes of a frame are fused, which layers are written, and how far this work is, for progress."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels
-from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.write_options import (
+    ALBEDO_LAYER,
+    ERROR_LAYER,
+    FRAMES_LAYER,
+    NORMAL_LAYER,
+    TRUST_LAYER,
+    WriteOptions,
+)
+from oiio_msspl.exr.writer import check_layout
 from oiio_msspl.model.catalogue import measured
 from oiio_msspl.model.session import Session
 
@@ -21,23 +29,25 @@ def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
     return [layers for layers in sets if not write.passes or any(layers.matches(p) for p in write.passes)]
 
 
-def uses_clean_aovs(hr: MappedRender, write: WriteOptions) -> bool:
-    """Return whether albedo and normal without noise are of use: as layers, or to fuse passes."""
-    return write.data_passes or bool(sets_to_fuse(hr, write))
-
-
-def check_passes(views: Sequence[MappedRender], write: WriteOptions) -> None:
-    """Check what is asked for by the headers.
+def check_layers(views: Sequence[MappedRender], write: WriteOptions) -> None:
+    """Check by the headers that the layers and passes that are asked for exist, and that one file can hold them all.
 
     Args:
         views: the HRLS, mapped for each of its views; the first one in front.
-        write: what is asked for.
 
     Raises:
-        InputError: no view has additive sets of this name, a sum of the user's is not to be fused, or the first view
-            lacks the data passes.
+        InputError: a pattern of ``write`` matches nothing, the layout can't hold the layers, no view has additive sets
+            of this name, a sum of the user's is not to be fused, or the first view lacks the data passes.
     """
     hr = views[0]
+    added = {
+        ERROR_LAYER: write.error_layer,
+        FRAMES_LAYER: write.frames_layer,
+        TRUST_LAYER: write.trust_layer,
+        ALBEDO_LAYER: write.data_passes and ALBEDO in hr.features,
+        NORMAL_LAYER: write.data_passes and NORMAL in hr.features,
+    }
+    check_layout(hr.file, hr.beauty_channels, write, [name for name, is_added in added.items() if is_added])
     if write.data_passes and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
         raise InputError(f"--data-passes: {hr.name} has neither an albedo nor a normal; name them with --map")
     if write.passes == ("none",) and any(layers.by_user for layers in hr.additive_sets):
@@ -57,8 +67,7 @@ def _written_sets(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
     if write.passes == ("none",):
         return []
     dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
-    written = (layers for layers in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in layers.layers))
-    return list(written)
+    return [layers for layers in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in layers.layers)]
 
 
 #: Cost of a megapixel, where 1 is Open Image Denoise's: one layer of a set, by fitting and by a network, and one
@@ -92,16 +101,16 @@ class Progress:
         self._tell(WHOLE, WHOLE)
 
 
-def costs_of(views: Sequence[tuple[MappedRender, MappedRender]], session: Session, write: WriteOptions) -> list[float]:
+def costs_of(views: Sequence[MappedRender], session: Session, write: WriteOptions) -> list[float]:
     """Return what the parts of a frame's work cost: tiles and passes of each view, and then writing."""
     of_tiles, costs = measured().get(session.name, {}).get("time_vnni", 1.0), []
     of_layer = FITTED_LAYER if session.layers is None else NETWORK_LAYER
-    for _, hr in views:
+    for hr in views:
         megapixels = hr.data_window.width * hr.data_window.height / 1e6
         costs.append(megapixels * of_tiles)
         if sets := sets_to_fuse(hr, write):
             costs.append(megapixels * of_layer * sum(len(additive.layers) for additive in sets))
-    file, dropped = views[-1][1].file, dropped_channels(views[-1][1].file, views[-1][1].beauty_channels, write.layers)
+    file, dropped = views[-1].file, dropped_channels(views[-1].file, views[-1].beauty_channels, write.layers)
     areas = (part.data_window.width * part.data_window.height / 1e6 for part in file.parts)
     kept = (sum(channel not in dropped for channel in part.channels) for part in file.parts)
     return [*costs, WRITTEN_CHANNEL * sum(area * count for area, count in zip(areas, kept, strict=True))]

@@ -21,16 +21,16 @@ from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.write import write_settled
 
-#: Called with a frame, and its report as a dict, the reason for its failure, or None if another run has fused it.
-Record = Callable[[FrameFiles, dict[str, Any] | Exception | None], None]
+#: What became of a frame: its report as a dict, the reason for its failure, or None if another run has fused it.
+Outcome = dict[str, Any] | Exception | None
+Record = Callable[[FrameFiles, Outcome], None]
 
 
 def run_pipeline(run: ShotRun, record: Record, save: Callable[[], None] = lambda: None) -> None:
-    """Fuse and write the frames of a shot. However this ends, the frame that is being written is finished and recorded.
+    """Fuse and write the frames of a shot.
 
     Args:
-        run: the shot.
-        record: called in the order of the frames.
+        record: called with each frame and its outcome, in the order of the frames.
         save: called after each frame, when the frames before it are recorded.
 
     Raises:
@@ -49,32 +49,18 @@ def run_pipeline(run: ShotRun, record: Record, save: Callable[[], None] = lambda
 
 def read_ahead(run: ShotRun) -> Generator[list[ShotFrame]]:
     """Yield the frames of a shot. Each is read while the caller works on the one before it."""
-    order = run.order
+    coming: Future[list[ShotFrame]] | None = None
     with ThreadPoolExecutor(1, "read") as reader:
-        reads = [submit(reader, run.read, files) for files in order[:1]]
-        try:
-            for files in [*order[1:], None]:
-                if not reads:
-                    return
-                views = reads.pop().result()
-                if files is not None:
-                    reads.append(submit(reader, run.read, files))
-                yield views
-        finally:
-            for reading in reads:
-                reading.cancel()
+        for files in [*run.order, None]:
+            read, coming = coming, None if files is None else submit(reader, run.read, files)
+            if read is not None:
+                yield read.result()
 
 
 class Writer:
     """Writes frames in a thread, one at a time, and records what became of each.
 
     On leaving its ``with`` block, however that comes, the frame that is being written is finished and recorded.
-
-    Args:
-        existing: what becomes of results that exist.
-        record: called in the order of the frames, with a frame and its report as a dict, the reason for its failure, or
-            None if another run has fused it in the meantime.
-        save: called after each frame, when the frames before it are recorded.
     """
 
     def __init__(self, existing: ExistingResults, record: Record, save: Callable[[], None]) -> None:

@@ -21,11 +21,10 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
-from oiio_msspl.jobs.inputs import InputOptions, MappedPair, map_other_hrls, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, MappedPair, find_views, map_other_hrls, map_pair
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import family_for_layers
-from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline, neighbours
-from oiio_msspl.jobs.views import find_other_views
+from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline
 from oiio_msspl.model.catalogue import QUALITIES, family_of
 from oiio_msspl.wording import worded
 
@@ -110,13 +109,6 @@ class ShotPlan:
     def absolute(self) -> ShotPlan:
         """Return the plan with absolute paths, for workers with other working directories."""
         return replace(self, frames={n: files.absolute() for n, files in self.frames.items()})
-
-    def files_beside(self, hr: Path) -> list[Path]:
-        """Return the renders of the neighbours of the frame whose HRLS this is."""
-        number = next((n for n, files in self.frames.items() if files.hr == hr), None) if self.count else None
-        numbers = [] if number is None else neighbours(number, self.count, self.frames)
-        paths = [path for n in numbers for path in (self.frames[n].lr, self.frames[n].hr)]
-        return [path for path in paths if path is not None]
 
     def missing(self, number: int) -> list[int]:
         """Return the numbers next to a frame that lie within the shot and lack a render."""
@@ -204,12 +196,11 @@ def _other_views(
     mapped: Callable[[int], MappedPair], numbers: Sequence[int], inputs: InputOptions, write: WriteOptions
 ) -> list[str]:
     """Return the views beside the first one that are fused in some of these frames."""
-    views: dict[str, None] = {}
+    views: list[str] = []
     for number in numbers:
         with suppress(InputError):  # the run says so when the turn of this frame has come
-            others = find_other_views(*mapped(number), inputs, write)
-            views |= dict.fromkeys(view.hr.view for view in others.views)
-    return list(views)
+            views += [view.hr.view for view in find_views(*mapped(number), inputs, write)[0][1:]]
+    return list(dict.fromkeys(views))
 
 
 def reach_of(count: int, kind: str) -> Reach:
@@ -228,96 +219,73 @@ def _motion_of(
     *,
     required: bool,
 ) -> MotionSource:
-    """Return the source of the motion of a view; None stands for each file's first view."""
+    """Return the source of the motion of a view; None stands for each file's first view.
+
+    The camera may stand still at one end, or move in one direction only, so several pairs of successive frames are
+    judged until they tell how vectors are stored. A frame that can't be read is passed over, because the run says so
+    when its turn comes.
+
+    Raises:
+        InputError: the user asks for neighbours, and no pair can be judged, or they contradict each other.
+    """
 
     def render(number: int) -> MappedRender:
         hr = mapped(number)[1]
         return hr if view is None else map_other_hrls(hr, view, inputs)
 
-    pairs = _JudgedPairs(render, options.motion_format, required)
+    def find(number: int, verified: Sequence[MotionField]) -> MotionSource:
+        return find_motion(render(number), render(number + 1), options.motion_format, verified, required=required)
+
+    sources: dict[int, MotionSource] = {}  # by the number of a pair's first frame
+    vectors: MotionSource | None = None
+    problem: InputError | None = None
     for number in numbers:
-        pairs.judge(number)
-        if pairs.suffice:
-            break
-    if pairs.sources:
-        return pairs.verdict()
-    assert pairs.problem is not None
-    if required or (options.motion_format is not None and view is None):
-        raise pairs.problem
-    return MotionSource(NONE, str(pairs.problem))
-
-
-class _JudgedPairs:
-    """Findings on the motion of a view, collected from pairs of successive frames.
-
-    The camera may stand still at one end, or move in one direction only, so several pairs are judged until they tell
-    how vectors are stored. What one pair shows has to hold for the pairs before. A frame that can't be read is passed
-    over, because the run says so when its turn comes.
-    """
-
-    def __init__(self, render: Callable[[int], MappedRender], motion_format: str | None, required: bool) -> None:
-        self._render, self._format, self._required = render, motion_format, required
-        self.sources: dict[int, MotionSource] = {}
-        """By the number of a pair's first frame."""
-        self.problem: InputError | None = None
-        """Why the first of the pairs that can't be judged can't be."""
-        self._vectors: MotionSource | None = None
-        self._contradiction = ""
-
-    @property
-    def suffice(self) -> bool:
-        """True if no further pair needs to be judged."""
-        settled = self._vectors is not None and not self._vectors.silent
-        return settled or len(self.sources) == PAIRS_JUDGED or bool(self._contradiction)
-
-    def judge(self, number: int) -> None:
-        """Judge a frame and the next one."""
-        vectors = self._vectors
         try:
-            if vectors and not vectors.tells_more(self._render(number)):
-                self.sources[number] = vectors
-                return
-            source = self._find(number, vectors.fields if vectors else ())
+            known = vectors is not None and not vectors.tells_more(render(number))
+            source = vectors if vectors and known else find(number, vectors.fields if vectors else ())
         except InputError as error:
-            self.problem = self.problem or error
+            problem = problem or error
             log.debug("frames %d and %d: %s", number, number + 1, error)
-            return
-        self.sources[number] = source
-        if source.kind == VECTORS:
-            self._add_vectors(number, source)
+            continue
+        sources[number] = source
+        if source.kind == VECTORS and not known:
+            vectors = _agreed_vectors(number, sources, vectors or source, find)
+        if (vectors and not vectors.silent) or len(sources) == PAIRS_JUDGED:
+            break
+    if problem is not None and not sources:
+        if required or (options.motion_format is not None and view is None):
+            raise problem
+        return MotionSource(NONE, str(problem))
+    if vectors and vectors.kind == NONE and required:
+        hint = "describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels"
+        raise InputError(f"{vectors.text}; {hint}")
+    preference = (CAMERA, STATIC, FLOW, NONE)
+    return vectors or min(sources.values(), key=lambda source: preference.index(source.kind))
 
-    def _find(self, number: int, verified: Sequence[MotionField]) -> MotionSource:
-        pair = self._render(number), self._render(number + 1)
-        return find_motion(*pair, self._format, verified, required=self._required)
 
-    def _add_vectors(self, number: int, latest: MotionSource) -> None:
-        """Bring vectors and those of the pairs before into agreement, and keep the pair that tells of most layers."""
-        vectors = self._vectors or latest
-        candidates = [vectors, latest]
-        if not _agree(latest, vectors):
-            candidates = [latest]
-            for before in [n for n, source in self.sources.items() if source.kind == VECTORS and n != number]:
-                candidates.append(self._find(before, latest.fields))
-                if not _agree(candidates[-1], latest):
-                    texts = "; ".join(f"frames {n} and {n + 1}: {self.sources[n].text}" for n in (before, number))
-                    self._contradiction = f"the frames contradict each other on how motion vectors are stored ({texts})"
-                    return
-        best = max(candidates, key=lambda source: len(source.fields))
-        self._vectors = replace(best, silent=latest.silent & vectors.silent)
+def _agreed_vectors(
+    number: int,
+    sources: Mapping[int, MotionSource],
+    vectors: MotionSource,
+    find: Callable[[int, Sequence[MotionField]], MotionSource],
+) -> MotionSource:
+    """Bring the vectors of a pair and those of the pairs before into agreement.
 
-    def verdict(self) -> MotionSource:
-        """Return the source that the pairs tell of.
-
-        Raises:
-            InputError: they contradict each other, and the user asks for neighbours.
-        """
-        if self._contradiction and self._required:
-            hint = "describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels"
-            raise InputError(f"{self._contradiction}; {hint}")
-        if self._contradiction:
-            return MotionSource(NONE, self._contradiction)
-        preference = (CAMERA, STATIC, FLOW, NONE)
-        return self._vectors or min(self.sources.values(), key=lambda source: preference.index(source.kind))
+    What one pair shows has to hold for the pairs before. The pair that tells of most layers is returned; a source that
+    is ``NONE`` if pairs contradict each other.
+    """
+    latest = sources[number]
+    candidates = [vectors, latest]
+    if not _agree(latest, vectors):
+        candidates = [latest]
+        for before in [n for n, source in sources.items() if source.kind == VECTORS and n != number]:
+            candidates.append(find(before, latest.fields))
+            if not _agree(candidates[-1], latest):
+                texts = "; ".join(f"frames {n} and {n + 1}: {sources[n].text}" for n in (before, number))
+                text = f"the frames contradict each other on how motion vectors are stored ({texts})"
+                return MotionSource(NONE, text)
+    best = max(candidates, key=lambda source: len(source.fields))
+    return replace(best, silent=latest.silent & vectors.silent)
 
 
 def _agree(one: MotionSource, other: MotionSource) -> bool:

@@ -160,6 +160,10 @@ def report_on(
     lr: MappedRender, hr: MappedRender, session: Session, fused: FusedFrame, output: Path, preview_path: Path | None
 ) -> FrameReport:
     """Report on a frame that is fused and not yet written: ``seconds`` is still empty."""
+    warnings = spp_warnings(lr, hr, session.contract)
+    if ALBEDO in session.contract.hrls and ALBEDO not in hr.features:
+        text = "no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"
+        warnings.insert(0, Finding("no_albedo", text))
     return FrameReport(
         lr=lr,
         hr=hr.for_model(session.contract.hrls),
@@ -172,12 +176,7 @@ def report_on(
         preview=preview_path,
         repaired=fused.repaired,
         negative=fused.negative,
-        warnings=[
-            *_aov_warnings(hr, session.contract),
-            *spp_warnings(lr, hr, session.contract),
-            *fused.warnings,
-            *_pass_warnings(hr, fused),
-        ],
+        warnings=[*warnings, *fused.warnings, *_pass_warnings(hr, fused)],
         tiles=fused.tiles,
         seconds={},
         features=frozenset(session.contract.hrls),
@@ -218,15 +217,11 @@ def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[Finding]:
         return []
     refused = fused.passes.refused
     named = [additive.name for additive in hr.additive_sets if additive.by_user and additive.name in refused]
-    passed_on = [
-        Finding("passes", f"--sum {name}: {refused[name]}; its layers of {hr.name} are passed on as they are")
-        for name in named
-    ]
-    return [*fused.passes.warnings, *passed_on]
+    texts = [f"--sum {name}: {refused[name]}; its layers of {hr.name} are passed on as they are" for name in named]
+    return [*fused.passes.warnings, *(Finding("passes", text) for text in texts)]
 
 
 def _passes(fused: FusedFrame) -> dict[str, str]:
-    """Say what was done with each additive set."""
     if fused.passes is None:
         return {}
     texts = {additive.name: f"fused: {additive.layer_names}" for additive in fused.passes.sets}
@@ -238,27 +233,16 @@ def _passes(fused: FusedFrame) -> dict[str, str]:
     return texts | refused
 
 
-def _aov_warnings(hr: MappedRender, contract: Contract) -> list[Finding]:
-    """Warn if the model reads an albedo and there is none."""
-    if ALBEDO not in contract.hrls or ALBEDO in hr.features:
-        return []
-    text = "no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"
-    return [Finding("no_albedo", text)]
-
-
 def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[Finding]:
     """Warn of samples per pixel that the method or the model was not made for."""
     if contract.scale == ONE_SIZE:
         return []
     warnings = []
     if lr.spp is not None and hr.spp is not None and lr.spp / contract.scale**2 < LEAST_SHARE * hr.spp:
-        warnings.append(
-            Finding(
-                "spp",
-                f"the LRHS has {lr.spp:g} spp and the HRLS {hr.spp:g}: the method expects more in the low-resolution "
-                "render",
-            )
+        text = (
+            f"the LRHS has {lr.spp:g} spp and the HRLS {hr.spp:g}: the method expects more in the low-resolution render"
         )
+        warnings.append(Finding("spp", text))
     for name, key, spp in (("HRLS", "hrls", hr.spp), ("LRHS", "lrhs", lr.spp)):
         trained = contract.training_spp.get(key)
         # Where a network saw fewer samples, it removes detail, which the renders give back to all but the paper's.
@@ -290,23 +274,20 @@ def provenance(report: FrameReport) -> dict[str, str]:
     views = {"msspl/views": ", ".join(name_of(view.hr.view) for view in report.fused_views())}
     lrhs, hrls = report.sources or (report.lr.name, report.hr.name)
     second = {} if report.is_one_render else {"msspl/lrhs": lrhs, "msspl/spp_lrhs": _spp(report.lr.spp)}
-    return (
-        (views if report.other_views else {})
-        | second
-        | {
-            "msspl/version": full_version(),
-            "msspl/model": report.model,
-            WEIGHTS_ATTRIBUTE: as_text(report.weights),
-            "msspl/provider": report.provider,
-            "msspl/scale": str(report.scale),
-            "msspl/hrls": hrls,
-            "msspl/spp_hrls": _spp(report.hr.spp),
-            "msspl/spp_average": _spp(report.spp_avg),
-            "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
-            "msspl/trust": "off" if report.trust is None else f"{report.trust:.4f}",
-            "msspl/passes": json.dumps(_fused_layers(report)),
-        }
-    )
+    return (views if report.other_views else {}) | {
+        **second,
+        "msspl/version": full_version(),
+        "msspl/model": report.model,
+        WEIGHTS_ATTRIBUTE: as_text(report.weights),
+        "msspl/provider": report.provider,
+        "msspl/scale": str(report.scale),
+        "msspl/hrls": hrls,
+        "msspl/spp_hrls": _spp(report.hr.spp),
+        "msspl/spp_average": _spp(report.spp_avg),
+        "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
+        "msspl/trust": "off" if report.trust is None else f"{report.trust:.4f}",
+        "msspl/passes": json.dumps(_fused_layers(report)),
+    }
 
 
 def _spp(spp: float | None) -> str:

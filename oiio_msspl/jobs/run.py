@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
+from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
 from oiio_msspl.fusion.motion.shot import ShotMotion
@@ -37,25 +39,24 @@ from oiio_msspl.fusion.tiles.tiling import require_memory, strips_memory
 from oiio_msspl.image.arrays import HALF_MAX, kept
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.existing import ExistingResults
-from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State
-from oiio_msspl.jobs.inputs import MappedPair
+from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State, features_read, read_frame
 from oiio_msspl.jobs.memory import check_frame_memory, light_features
-from oiio_msspl.jobs.passes import Progress, costs_of, sets_to_fuse, uses_clean_aovs
+from oiio_msspl.jobs.passes import Progress, costs_of, sets_to_fuse
 from oiio_msspl.jobs.plan import ShotPlan
-from oiio_msspl.jobs.read import features_read, read_frame
 from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, written_layers
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key, neighbours
-from oiio_msspl.jobs.views import store_view
+from oiio_msspl.jobs.write import store_view
 from oiio_msspl.model.contract import ONE_SIZE
+
+F = TypeVar("F", RenderPair, FusedFrame)
 
 
 class ShotRun:
     """Fuses the frames of a shot. A frame is kept until no other frame needs it.
 
     Args:
-        settings, plan: how frames are fused.
         wanted: the frames to write.
         only_frame: the shot is a single frame, which has all memory to itself.
         tell: called with (thousandths done, 1000) of the work on a single frame.
@@ -102,8 +103,7 @@ class ShotRun:
         self._frames.update({frame.key: frame for frame in views})
         for key in self._timeline.fusable(views[0].number):
             frame = self._frames[key]
-            self._average_renders(frame)
-            self._fuse(frame)
+            self._average_and_fuse(frame)
             self._stop_at_error(frame)
             self._timeline.fused(key)
             for number in self._timeline.settled():
@@ -114,12 +114,14 @@ class ShotRun:
                 del first  # or its pixels would be held while the next frame is fused
             self._release()
 
-    def _average_renders(self, frame: ShotFrame) -> None:
-        """Average the renders of a frame with those of its neighbours."""
-        missing = self.plan.missing(frame.number)
+    def _average_and_fuse(self, frame: ShotFrame) -> None:
+        """Average the renders of a frame with those of its neighbours, and let the network fuse the means.
+
+        The views that are fused by themselves come before.
+        """
         frame.warnings += [
             Finding("missing_neighbour", f"frame {number} is missing, so fewer neighbours are averaged")
-            for number in missing
+            for number in self.plan.missing(frame.number)
         ]
         if frame.error is not None:
             return
@@ -128,30 +130,37 @@ class ShotRun:
         with frame.attempt():
             if not self.plan.count and self.existing.skips(frame.files):
                 raise InputError("another run has fused it")  # is recorded as skipped
-            check_frame_memory(
-                frame.lr, frame.hr, frame.session, frame.write, self.settings.max_memory, frame.held_bytes
-            )
-            before, after = self._hops_of_renders(frame) if frame.plan.reach.renders else ([], [])
+            layers = bytes_held(frame.hr.file, frame.hr.beauty_channels, frame.write)
+            most, held = self.settings.max_memory, frame.held_bytes
+            check_frame_memory(align(frame.lr, frame.hr), frame.session, frame.write, most, layers, held)
             frame.averaged = frame.read_if_small() if self._only_frame else frame.renders
-            if before or after:
-                _replace_by_means(frame, before, after)
+            if frame.plan.reach.renders:
+                self._average_renders(frame)
             frame.state = State.AVERAGED
-        frame.seconds["fuse"] = time.perf_counter() - start
-
-    def _fuse(self, frame: ShotFrame) -> None:
-        """Let the network fuse a frame, after the views that are fused by themselves."""
-        if frame.error is not None:
-            return
-        start = time.perf_counter()
-        with frame.attempt():
-            frame.progress = self._progress(frame)
+            if self._tell is not None:
+                views = [view.hr for view in (*frame.others, frame)]
+                frame.progress = Progress(self._tell, costs_of(views, frame.session, frame.write))
             if frame.number in self._wanted:
                 self._fuse_others(frame)
             frame.fused = self.fuse(frame)
             frame.state = State.FUSED
             if frame.plan.reach.results:
                 frame.keep_result()
-        frame.seconds["fuse"] += time.perf_counter() - start
+        frame.seconds["fuse"] = time.perf_counter() - start
+
+    def _average_renders(self, frame: ShotFrame) -> None:
+        """Put the means over neighbours in the place of a frame's renders, and keep what its passes are fused from."""
+        before, after = self._hops(frame, "renders", lambda other: other.require_state(State.READ).renders)
+        if not (before or after):
+            return
+        lacking = any(lacking_passes(frame.renders, hop.frame) for hop in (*before, *after))
+        passes = [] if lacking else light_features(frame.stored[1])
+        features = [*features_read(frame.session), *passes]
+        lr, hr, frame.frame_counts = average_renders(frame.renders, before, after, features)
+        frame.averaged = RenderPair(lr, hr)
+        if passes:
+            high = _for_passes(hr, on_disk=is_large(frame.hr))
+            frame.means = high if lr is hr else _for_passes(lr, on_disk=is_large(frame.hr)), high
 
     def _fuse_others(self, first: ShotFrame) -> None:
         """Fuse the views without neighbours, and store them, so that memory holds one at a time."""
@@ -168,21 +177,21 @@ class ShotRun:
         """Fuse the passes of a view, and store it among the channels that all views of a frame replace."""
         picture.replaced = first.replaced = first.replaced or ReplacedChannels()
         self._fuse_passes(view, picture)
-        view.report = store_view(MappedPair(view.lr, view.hr), picture, view.session)
+        store_view(view.hr, picture, picture.replaced)
+        view.report = report_on(view.lr, view.hr, view.session, picture, view.hr.file.path, None)
 
     def fuse(self, frame: ShotFrame) -> FusedFrame:
         """Fuse the averaged renders of a frame."""
         # Other views are stored as float first, and fused frames that are averaged are float.
-        half = frame.view is None and not self.plan.count
-        half = half and stored_type(frame.hr.beauty_channels, frame.write) == "half"
+        is_stored = frame.view is None and not self.plan.count
         fused = fuse(
             frame.averaged.lr,
             frame.averaged.hr,
             frame.session,
             error=frame.write.error_layer,
             trust=frame.write.trust,
-            clean_aovs=uses_clean_aovs(frame.hr, frame.write),
-            half=half,
+            clean_aovs=frame.write.data_passes or bool(sets_to_fuse(frame.hr, frame.write)),
+            half=is_stored and stored_type(frame.hr.beauty_channels, frame.write) == "half",
             share=_share_by_spp(frame.lr, frame.hr),
             max_memory=self.settings.max_memory,
             held=frame.held_bytes,
@@ -228,18 +237,24 @@ class ShotRun:
         report = report_on(first.lr, first.hr, first.session, picture, first.files.output, first.files.preview)
         report.layers = written_layers(first.hr, first.write)
         views = sorted(others, key=lambda other: first.hr.other_views.index(other.hr.view))
-        passed_on = [Finding("view_not_fused", text) for text in first.passed_on]
-        add_other_views(report, [view.report for view in views], [*passed_on, *self._unplanned_views(first)])
+        findings = [Finding("view_not_fused", text) for text in first.passed_on]
+        why = "is fused frame by frame: the frames by which its motion is found lack it"
+        unplanned = [
+            view.hr.view for view in first.others if self.plan.count and view.hr.view not in self.plan.looked_at
+        ]
+        findings += [Finding("not_averaged", f"{name_of(view)} {why}") for view in unplanned]
+        add_other_views(report, [view.report for view in views], findings)
         return report
 
     def _average_results(self, frame: ShotFrame) -> FusedFrame:
         """Average a fused frame with its neighbours. Those that are missing or broken are named in its warnings."""
-        assert frame.fused is not None
+        picture = frame.result
         if not self.plan.count:
-            return frame.fused
-        before, after = self._hops_of_results(frame)
-        warnings = list(dict.fromkeys([*frame.fused.warnings, *frame.warnings]))
-        picture = average_results(frame.fused, before, after) if before or after else frame.fused
+            return picture
+        before, after = self._hops(frame, "results", lambda other: other.require_state(State.FUSED).result)
+        warnings = list(dict.fromkeys([*picture.warnings, *frame.warnings]))
+        if before or after:
+            picture = average_results(picture, before, after)
         # Averages of averages count no frame twice.
         most = 1 + len(neighbours(frame.number, self.plan.count, self.plan.frames))
         frames = None if picture.frames is None else np.minimum(picture.frames, np.float32(most))
@@ -250,16 +265,15 @@ class ShotRun:
         sets = sets_to_fuse(frame.hr, frame.write)
         if not sets:
             return
-        session, beauty, decoded = frame.session, picture.rgb, (frame.renders.lr, frame.renders.hr)
+        session, beauty, renders = frame.session, picture.rgb, (frame.renders.lr, frame.renders.hr)
         session.release_memory()  # for the passes
         if stored_type(frame.hr.beauty_channels, frame.write) == "half" and beauty.dtype != np.float16:
             # The passes sum to the beauty that is written.
             beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
+        about = picture.alignment, sets, picture.clean_aovs
         with limit_threads(session.threads):
             picture.passes = fuse_passes(
-                PassInputs(
-                    frame.lr, frame.hr, beauty, picture.alignment, sets, picture.clean_aovs, frame.means, decoded
-                ),
+                PassInputs(frame.lr, frame.hr, beauty, *about, frame.means, renders),
                 picture.replaced,
                 fuse_layers=layer_fuser(session, picture),
                 cache_bytes=strips_memory(self.settings.max_memory - frame.held_bytes, picture.nbytes),
@@ -268,42 +282,16 @@ class ShotRun:
         picture.replaced = picture.passes.pixels
         session.release_layer_memory()
 
-    def _unplanned_views(self, first: ShotFrame) -> list[Finding]:
-        """Return a sentence for each view that is fused frame by frame because the plan does not know it."""
-        names = [view.hr.view for view in first.others if self.plan.count]
-        new = [name_of(name) for name in names if name not in self.plan.looked_at]
-        why = "is fused frame by frame: the frames by which its motion is found lack it"
-        return [Finding("not_averaged", f"{name} {why}") for name in new]
+    def _hops(self, frame: ShotFrame, kind: str, content_of: Callable[[ShotFrame], F]) -> list[list[Hop[F]]]:
+        """Return the hops before and after a frame to the neighbours whose "renders" or "results" are averaged."""
 
-    def _hops_of_renders(self, frame: ShotFrame) -> list[list[Hop[RenderPair]]]:
-        """Return the hops to the neighbours before and after a frame whose renders are averaged with its own."""
-
-        def frame_of(number: int) -> tuple[MotionFrame, RenderPair]:
+        def frame_of(number: int) -> tuple[MotionFrame, F]:
             neighbour = self._frames[number, frame.view]
-            neighbour.require_state(State.READ)
-            return neighbour.motion_frame(), neighbour.renders
+            content = content_of(neighbour)
+            return neighbour.motion_frame(), content
 
-        motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, "renders")
+        motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, kind)
         return [find_hops(motion, frame.number, side, frame_of, frame.warnings) for side in sides]
-
-    def _hops_of_results(self, frame: ShotFrame) -> list[list[Hop[FusedFrame]]]:
-        """Return the hops to the neighbours before and after a frame whose fused pictures are averaged with its own."""
-
-        def frame_of(number: int) -> tuple[MotionFrame, FusedFrame]:
-            neighbour = self._frames[number, frame.view]
-            neighbour.require_state(State.FUSED)
-            assert neighbour.fused is not None
-            return neighbour.motion_frame(), neighbour.fused
-
-        motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, "results")
-        return [find_hops(motion, frame.number, side, frame_of, frame.warnings) for side in sides]
-
-    def _progress(self, frame: ShotFrame) -> Progress | None:
-        """Return what joins the progress of all parts of the work on a single frame."""
-        if self._tell is None:
-            return None
-        pairs = [(view.lr, view.hr) for view in (*frame.others, frame)]
-        return Progress(self._tell, costs_of(pairs, frame.session, frame.write))
 
     def _release(self) -> None:
         """Forget what no frame needs any more."""
@@ -313,26 +301,13 @@ class ShotRun:
                 del self._frames[key]
                 continue
             if key not in renders and frame.state >= State.READ:
-                frame.forget_pixels()
+                frame.renders = RenderPair(*frame.stored)  # the files can still be read
             if key not in pictures:
                 frame.fused = None
             if not self._timeline.waits(frame.number):
                 frame.forget_all_but_picture()
         for view, motion in self._motion.items():
             motion.keep({number for number, own in self._frames if own == view})
-
-
-def _replace_by_means(frame: ShotFrame, before: Sequence[Hop[RenderPair]], after: Sequence[Hop[RenderPair]]) -> None:
-    """Put the means over neighbours in the place of a frame's renders, and keep what its passes are fused from."""
-    passes = light_features(frame.stored[1])
-    if any(lacking_passes(frame.renders, hop.frame) for hop in (*before, *after)):
-        passes = []
-    lr, hr, frame.frame_counts = average_renders(frame.renders, before, after, [*features_read(frame.session), *passes])
-    frame.averaged = RenderPair(lr, hr)
-    if passes:
-        on_disk = is_large(frame.hr)
-        high = _kept(hr, on_disk=on_disk)
-        frame.means = high if lr is hr else _kept(lr, on_disk=on_disk), high
 
 
 def _share_by_spp(lr: MappedRender, hr: MappedRender) -> float | None:
@@ -342,7 +317,7 @@ def _share_by_spp(lr: MappedRender, hr: MappedRender) -> float | None:
     return lr.spp / (lr.spp + hr.spp)
 
 
-def _kept(render: Render, *, on_disk: bool) -> Render:
+def _for_passes(render: Render, *, on_disk: bool) -> Render:
     """Return what passes are fused from of a render that waits for its neighbours."""
     needed = [name for name in render.layers if name in (RGB, ALBEDO, NORMAL) or is_light_of_pass(name)]
     return replace(render, layers={name: kept(render.layers[name], on_disk=on_disk) for name in needed})

@@ -106,6 +106,12 @@ class FrameFiles:
     """The PNG to write beside the EXR, if any."""
 
     @property
+    def pair(self) -> tuple[Path, Path]:
+        """The files of both renders, which exist."""
+        assert self.lr is not None and self.hr is not None
+        return self.lr, self.hr
+
+    @property
     def targets(self) -> list[Path]:
         """The files to write."""
         return [path for path in (self.output, self.preview) if path is not None]
@@ -131,8 +137,10 @@ class Shot:
         return self.lr is self.hr
 
     def target(self, number: int) -> Path:
-        """Return the file of a fused frame."""
-        return _target(self.output, self.hr, number)
+        """Return the file of a fused frame. In a folder it is named as the HRLS, whose frames may differ in padding."""
+        if self.output.number is self.hr.pattern.number and number in self.hr.files:
+            return self.output.folder / _with_exr(self.hr.files[number].name)
+        return self.output.path(number)
 
 
 def is_sequence(path: Path) -> bool:
@@ -171,19 +179,18 @@ def find_shot(
     """
     found = [_not_written(_sequences(Path(path)), Path(output)) for path in (lr, hr) if path is not None]
     if lr is None:
-        low = high = _only(found[0], Path(hr))
+        low = high = found[0][0]
+        if len(found[0]) > 1:
+            names = ", ".join(sequence.pattern.name for sequence in found[0][:6])
+            raise InputError(
+                f"{Path(hr)}: has several sequences ({names}); name the one to fuse, or two that belong together"
+            )
     else:
         low, high = _choose(found[0], found[1], Path(lr), Path(hr))
     numbers = sorted(low.files.keys() | high.files.keys()) if frames is None else parse_frames(frames)
-    pattern = _output_pattern(Path(output), high.pattern)
-    files = [FrameFiles(n, low.files.get(n), high.files.get(n), _target(pattern, high, n)) for n in numbers]
-    return Shot(low, high, pattern, files)
-
-
-def _target(output: Pattern, hr: Sequence, number: int) -> Path:
-    """Return the file of a fused frame. In a folder it is named as the HRLS, whose frames may differ in padding."""
-    in_folder = output.number is hr.pattern.number
-    return output.folder / _with_exr(hr.files[number].name) if in_folder and number in hr.files else output.path(number)
+    shot = Shot(low, high, _output_pattern(Path(output), high.pattern), [])
+    shot.frames.extend(FrameFiles(n, low.files.get(n), high.files.get(n), shot.target(n)) for n in numbers)
+    return shot
 
 
 def _with_exr(name: str) -> str:
@@ -345,14 +352,6 @@ def _sequences_in(folder: Path) -> list[Sequence]:
             raise InputError(f"{pattern}: some numbers occur with and without zeros in front; give a pattern")
         sequences.append(Sequence(pattern, files))
     return sequences
-
-
-def _only(sequences: list[Sequence], path: Path) -> Sequence:
-    """Return the only sequence of a folder, or of a pattern."""
-    if len(sequences) > 1:
-        names = ", ".join(sequence.pattern.name for sequence in sequences[:6])
-        raise InputError(f"{path}: has several sequences ({names}); name the one to fuse, or two that belong together")
-    return sequences[0]
 
 
 def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> tuple[Sequence, Sequence]:

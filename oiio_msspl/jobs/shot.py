@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuses a shot: every frame of two sequences, or of one, in this process or on a Dask cluster.
 
-A bad frame is reported and does not stop the others. A new EXR gets its name last, after its preview, so an EXR that
-exists is a complete frame. An EXR that is replaced comes before its preview, so a run that is killed between the two
-leaves the new frame without a preview.
+A bad frame is reported and does not stop the others. An EXR that is replaced comes before its preview, so a run that is
+killed between the two leaves the new frame without a preview.
 """
 
 from __future__ import annotations
@@ -16,19 +15,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import InputError, MssplError, explain
-from oiio_msspl.exr.atomic import remove_leftovers
+from oiio_msspl.exr.atomic import check_folder, make_folder, remove_leftovers
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.checks import check_first_pair, check_output, look_ahead, make_output, model_of_shot
+from oiio_msspl.jobs.checks import check_first_pair, check_output, look_ahead, model_of_shot
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.farm.dask import fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
-from oiio_msspl.jobs.pipeline import run_pipeline
+from oiio_msspl.jobs.pipeline import Outcome, run_pipeline
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions, plan_temporal
 from oiio_msspl.jobs.run import ShotRun
-from oiio_msspl.jobs.sequence import FrameFiles, Shot, find_shot
+from oiio_msspl.jobs.sequence import FrameFiles, find_shot
 from oiio_msspl.jobs.settings import Settings, bytes_of
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.model.devices import require_device
@@ -108,7 +107,10 @@ def fuse_shot(
         temporal = TemporalOptions(temporal)
     shot = find_shot(lr, hr, output, frames)
     if previews:
-        shot = _with_previews(shot, view_transform)
+        if view_transform is not None:
+            check_view(view_transform)
+        frames_to_fuse = [replace(files, preview=files.output.with_suffix(".png")) for files in shot.frames]
+        shot = replace(shot, frames=frames_to_fuse)
     if client is None:  # workers of a cluster may have other devices
         require_device(device)
     path = None if report_path is None else Path(report_path)
@@ -119,18 +121,19 @@ def fuse_shot(
     settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update, strict)
     report = ShotReport(shot, temporal=plan.text, neighbours=plan.count, warnings=plan.warnings)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
-    make_output(shot)
+    make_folder(shot.output.folder)
+    check_folder(shot.output.path(0))
     running = _RunningReport(report, path, progress, start)
     existing = ExistingResults(settings, plan)
     if odd := existing.dated_in_future(shot.frames):
         log.warning(
             worded(f"{odd}: is dated in the future, so --update can't tell what is newer; set its date (touch)")
         )
-    to_fuse = running.add_known(existing, earlier)
+    to_fuse, skipped = running.add_known(existing, earlier)
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model))
-        ExistingResults(settings, plan).check_weights(running.skipped())
+        ExistingResults(settings, plan).check_weights(skipped)
         report.found = look_ahead(to_fuse, settings)
         if client is None and report.found is not None:
             settings.session(report.found["scale"])  # a model that can't be used is refused before anything is told
@@ -153,12 +156,6 @@ def fuse_shot(
     return report
 
 
-def _with_previews(shot: Shot, view_transform: str | None) -> Shot:
-    if view_transform is not None:
-        check_view(view_transform)
-    return replace(shot, frames=[replace(files, preview=files.output.with_suffix(".png")) for files in shot.frames])
-
-
 @dataclass
 class _RunningReport:
     """The report of a shot that runs, and who is told of it."""
@@ -169,40 +166,36 @@ class _RunningReport:
     start: float
 
     def add(self, result: FrameResult) -> None:
-        """Add the result of a frame."""
         self.report.results[result.frame] = result
         self.report.seconds = time.perf_counter() - self.start
         if self.progress is not None:
             self.progress(result, self.report)
 
-    def add_known(self, existing: ExistingResults, earlier: dict[int, dict[str, Any]]) -> list[FrameFiles]:
-        """Add the frames that are skipped, missing or blocked by an existing file, and return those to fuse.
+    def add_known(
+        self, existing: ExistingResults, earlier: dict[int, dict[str, Any]]
+    ) -> tuple[list[FrameFiles], list[FrameFiles]]:
+        """Add the frames that are skipped, missing or blocked by an existing file. Return those to fuse and to skip.
 
         A skipped frame keeps its entry of an ``earlier`` report.
         """
-        to_fuse = []
+        to_fuse, skipped = [], []
         for frame in self.report.shot.frames:
             result = existing.known_result(frame, self.report.shot)
             if result is None:
                 to_fuse.append(frame)
                 continue
-            if result.status == SKIPPED and (entry := earlier.get(frame.number)):
-                warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
-                result = replace(result, **entry | {"warnings": warnings})
+            if result.status == SKIPPED:
+                skipped.append(frame)
+                if entry := earlier.get(frame.number):
+                    warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
+                    result = replace(result, **entry | {"warnings": warnings})
             self.add(result)
         first = self.report.first
         if first is not None and first["frame"] in {frame.number for frame in to_fuse}:
             self.report.first = None  # its result is replaced
-        return to_fuse
+        return to_fuse, skipped
 
-    def skipped(self) -> list[FrameFiles]:
-        """Return the frames that are skipped so far."""
-        results = self.report.results
-        numbers = {number for number, result in results.items() if result.status == SKIPPED}
-        return [frame for frame in self.report.shot.frames if frame.number in numbers]
-
-    def add_outcome(self, frame: FrameFiles, outcome: dict[str, Any] | Exception | None) -> None:
-        """Add the result of a frame: from its report, the reason for its failure, or None if its EXR existed."""
+    def add_outcome(self, frame: FrameFiles, outcome: Outcome) -> None:
         if isinstance(outcome, Exception):
             log.debug("frame %d", frame.number, exc_info=outcome)
             self.add(result_of(frame, FAILED, *explain(outcome)))
@@ -214,17 +207,12 @@ class _RunningReport:
     def save(self) -> None:
         """Save the report after a frame. A failure is only logged, because a full disk may have room later."""
         try:
-            if self.path is not None:
-                self.report.save(self.path)
+            self.close()
         except MssplError as error:
             log.warning("%s", error)
 
     def close(self) -> None:
-        """Save the report at the end of the run.
-
-        Raises:
-            MssplError: the file system refused.
-        """
+        """Save the report at the end of the run. Raise MssplError if the file system refuses."""
         self.report.seconds = time.perf_counter() - self.start
         if self.path is not None:
             self.report.save(self.path)

@@ -196,25 +196,14 @@ def fused_result(frame: FrameFiles, frame_report: dict[str, Any], report: ShotRe
     if counted is not None and counted < ALONE:
         text = "its neighbours hardly count: their light or their surfaces differ from those of this frame"
         warnings.append(Finding("neighbours_differ", text))
-    warnings += [
-        Finding("flicker", f"{text} in frame {first['frame']}: it may flicker") for text in _differences(here, first)
-    ]
-    more = {name: frame_report[name] for name in _OF_FRAME}
-    return result_of(frame, FUSED, warnings=warnings, **more)
-
-
-def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """Compare the reports of two fused frames: "WHAT is X here and Y" for each difference."""
-    return [
-        *_changed_settings(here, first),
-        *_changed_layers(here, first),
-        *_changed_views(here, first),
-        *_changed_sets(here["passes"], first["passes"]),
-    ]
+    for changed in (_changed_settings, _changed_layers, _changed_views, _changed_sets):
+        texts = [f"{text} in frame {first['frame']}: it may flicker" for text in changed(here, first)]
+        warnings += [Finding("flicker", text) for text in texts]
+    return result_of(frame, FUSED, warnings=warnings, **{name: frame_report[name] for name in _OF_FRAME})
 
 
 def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """Compare the features, the size, the scale, the model and its weights, the version and the neighbours."""
+    """Compare all but layers: "WHAT is X here and Y" for each difference between the reports of two fused frames."""
     words = {"default": "not found", "absent": "not found"}
     before, now = (
         {row["feature"]: words.get(row["status"], row["status"]) for row in report["aovs"] if row["status"] != "unused"}
@@ -245,7 +234,6 @@ def _changed_layers(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
 
 
 def _changed_views(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """Compare the views that are fused."""
     # The report on a file with only one view has an empty list.
     entries = [report.get("fused_views") or [report] for report in (here, first)]
     now, before = ([name_of(entry["view"] or "") for entry in views] for views in entries)
@@ -255,11 +243,12 @@ def _changed_views(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
     return lacking + [f"{view} is fused here and not fused" for view in now if view not in before]
 
 
-def _changed_sets(here: dict[str, str], first: dict[str, str]) -> list[str]:
+def _changed_sets(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
     """Compare what was done with each set of passes, by name; with the reason if one is not fused."""
     texts = []
-    for name in dict.fromkeys([*first, *here]):
-        (state, reason), (before, _) = (sets.get(name, "missing").partition(": ")[::2] for sets in (here, first))
+    both = here["passes"], first["passes"]
+    for name in dict.fromkeys([*first["passes"], *here["passes"]]):
+        (state, reason), (before, _) = (sets.get(name, "missing").partition(": ")[::2] for sets in both)
         if state != before:
             because = f" ({reason})" if reason and state != "fused" else ""
             texts.append(f"{name}: {state} here{because} and {before}")
@@ -295,10 +284,11 @@ def read_earlier(
         raise InputError(f"{path}: exists and is too large for a report of a shot; name another file")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        entries = {
-            entry["frame"]: {name: entry[name] for name in _OF_FRAME} | {"warnings": _kept_warnings(entry)}
-            for entry in data["frames"]
-        }
+        entries = {}
+        for entry in data["frames"]:
+            coded = zip(entry["warning_codes"], entry["warnings"], strict=True)
+            kept = [Finding(code, text) for code, text in coded if code != OLDER]
+            entries[entry["frame"]] = {name: entry[name] for name in _OF_FRAME} | {"warnings": kept}
         output = data.get("output")
         first = data["first_fused"]
         if skip_existing:
@@ -313,12 +303,6 @@ def read_earlier(
     if isinstance(output, str) and os.path.realpath(output) != os.path.realpath(str(report.shot.output)):
         raise InputError(f"{path}: is the report of another shot, whose frames are {output}; name another file")
     return entries
-
-
-def _kept_warnings(entry: dict[str, Any]) -> list[Finding]:
-    """Return the warnings of a frame's entry in an earlier report, without that of :func:`older_than`."""
-    coded = zip(entry["warning_codes"], entry["warnings"], strict=True)
-    return [Finding(code, text) for code, text in coded if code != OLDER]
 
 
 def older_than(path: Path) -> Finding:

@@ -54,62 +54,63 @@ class Timeline:
 
     def __init__(self, shot: Collection[int], wanted: Sequence[int], reach: Mapping[str | None, Reach]) -> None:
         self._shot, self._reach = shot, reach
-        self._wanted = list(wanted)
         self._read: set[int] = set()
         self._fused: set[Key] = set()
+        #: The frames to write, each with the frames whose fused pictures it needs: its views and their neighbours.
+        self._unsettled = {
+            number: {(n, view) for view, own in reach.items() for n in (number, *neighbours(number, own.results, shot))}
+            for number in wanted
+        }
+        keys = self.needs_pictures()
         most = max(own.frames for own in reach.values())
-        pictures = [{n for w in wanted for n in (w, *neighbours(w, own.results, shot))} for own in reach.values()]
-        numbers = dict.fromkeys(wanted) if most == 0 else sorted(set().union(*pictures))
-        self._unfused: list[Key] = [
-            (n, view) for n in numbers for view, own in zip(reach, pictures, strict=True) if n in own
-        ]
-        self.order = list(numbers)
+        numbers = list(dict.fromkeys(wanted)) if most == 0 else sorted({number for number, _ in keys})
+        #: The frames to fuse, each with the frames whose renders it needs: itself and its neighbours.
+        self._unfused = {
+            (number, view): {(n, view) for n in (number, *neighbours(number, own.renders, shot))}
+            for number in numbers
+            for view, own in reach.items()
+            if (number, view) in keys
+        }
+        self.order = numbers
         """The frames to read, in this order: those to write, and all that these depend on."""
         if most:
             self.order = sorted({n for w in wanted for n in (w, *neighbours(w, most, shot))})
 
-    def around(self, key: Key, kind: str) -> list[int]:
-        """Return the neighbours of a frame whose ``"renders"`` or ``"results"`` are averaged with its own."""
-        number, view = key
-        return neighbours(number, getattr(self._reach[view], kind), self._shot)
-
     def sides(self, key: Key, kind: str) -> tuple[list[int], list[int]]:
-        """Return these neighbours before and after a frame, the nearest first."""
-        numbers = self.around(key, kind)
+        """Return the neighbours before and after a frame whose "renders" or "results" are averaged with its own.
+
+        The nearest comes first.
+        """
+        numbers = neighbours(key[0], getattr(self._reach[key[1]], kind), self._shot)
         return [n for n in numbers if n < key[0]][::-1], [n for n in numbers if n > key[0]]
 
     def waits(self, number: int) -> bool:
         """Return whether a frame is still to be settled."""
-        return number in self._wanted
+        return number in self._unsettled
 
     def fusable(self, number: int) -> Iterator[Key]:
         """Take a frame that is read, and yield what can be fused now."""
         self._read.add(number)
-        for key in list(self._unfused):
-            if self._read.issuperset((key[0], *self.around(key, "renders"))):
+        for key, needed in list(self._unfused.items()):
+            if self._read.issuperset(n for n, _ in needed):
                 yield key
 
     def fused(self, key: Key) -> None:
         """Take a frame that is fused, or that has failed."""
-        self._unfused.remove(key)
+        del self._unfused[key]
         self._fused.add(key)
 
     def settled(self) -> Iterator[int]:
         """Yield the frames to write whose views and neighbours are fused, each once."""
-        for number in list(self._wanted):
-            keys = [(number, view) for view in self._reach]
-            if all(self._fused.issuperset((key, *self._pictures_of(key))) for key in keys):
-                self._wanted.remove(number)
+        for number, needed in list(self._unsettled.items()):
+            if self._fused.issuperset(needed):
+                del self._unsettled[number]
                 yield number
-
-    def _pictures_of(self, key: Key) -> list[Key]:
-        return [(number, key[1]) for number in self.around(key, "results")]
 
     def needs_renders(self) -> set[Key]:
         """Return the frames whose renders a frame needs that is still to be fused."""
-        return {(n, key[1]) for key in self._unfused for n in (key[0], *self.around(key, "renders"))}
+        return set().union(*self._unfused.values())
 
     def needs_pictures(self) -> set[Key]:
         """Return the frames whose fused pictures a frame needs that is still to be written."""
-        keys = [(number, view) for number in self._wanted for view in self._reach]
-        return {needed for key in keys for needed in (key, *self._pictures_of(key))}
+        return set().union(*self._unsettled.values())

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msspl_cli.installed import find_msspl_fuse
+from msspl_cli.commands.nuke_install import find_msspl_fuse
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr

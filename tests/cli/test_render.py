@@ -21,7 +21,8 @@ from oiio_msspl import fuse_files
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import temporary_folder
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.jobs import memory, read
+from oiio_msspl.jobs import frame as reading
+from oiio_msspl.jobs import memory
 from oiio_msspl.jobs.blender_source import RenderedShot
 from oiio_msspl.jobs.plan import TemporalOptions
 from oiio_msspl.jobs.sequence import FrameFiles
@@ -285,8 +286,8 @@ def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model
 def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, bilinear_models, moving, monkeypatch):
     """And their memory is counted."""
     loaded, counted = [], []
-    load, counts = read._read_pixels, memory._vector_bytes
-    monkeypatch.setattr(read, "_read_pixels", lambda frame: loaded.append(load(frame) or frame))
+    load, counts = reading._read_pixels, memory._vector_bytes
+    monkeypatch.setattr(reading, "_read_pixels", lambda frame: loaded.append(load(frame) or frame))
     monkeypatch.setattr(memory, "_vector_bytes", lambda hr, channels: counted.append(channels) or counts(hr, channels))
     frames = [FrameFiles(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
     shot = RenderedShot(Settings(model=str(bilinear_models[4])), 2, 4, frames, frames, TemporalOptions("auto"))

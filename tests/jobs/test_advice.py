@@ -8,8 +8,8 @@ import pytest
 
 from oiio_msspl.inspection import inspect_file, inspect_noise
 from oiio_msspl.jobs import advice
+from oiio_msspl.jobs.fitting import check_files
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
-from oiio_msspl.jobs.pair_check import check_files
 from tests.conftest import downsample, noisy, picture, rgb, spread, write_exr
 from tests.test_pages import ROOT
 

@@ -11,7 +11,7 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.inspection import inspect_file, inspect_noise
 from oiio_msspl.jobs.farm.openjd import make_job
-from oiio_msspl.jobs.pair_check import check_files
+from oiio_msspl.jobs.fitting import check_files
 from oiio_msspl.jobs.sequence import find_shot
 from oiio_msspl.model.encoding import encode_radiance
 from tests.conftest import noisy, picture, read_bits, rgb, same_bits, spread, write_exr

@@ -19,7 +19,8 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion.source import FLOW, VECTORS
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image import parallel
-from oiio_msspl.jobs import memory, read
+from oiio_msspl.jobs import frame as reading
+from oiio_msspl.jobs import memory
 from oiio_msspl.jobs import run as run_module
 from oiio_msspl.jobs.memory import ViewMemory, memory_to_average
 from oiio_msspl.jobs.plan import AUTO_COUNT, ShotPlan, TemporalOptions, ViewPlan, plan_temporal, reach_of
@@ -273,7 +274,7 @@ def test_frames_beside_one_that_failed_for_another_reason_fail_too(tmp_path, bil
     more = {"model": str(bilinear_models[4]), "temporal": TemporalOptions("2")}
     pair = folder / "lr", folder / "hr"
     fuse_shot(*pair, folder / "clean", **more)
-    owner = ShotRun if stage == "fuse" else read
+    owner = ShotRun if stage == "fuse" else reading
     real = getattr(owner, stage)
 
     def faulty(*arguments):
@@ -300,8 +301,8 @@ def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bili
     fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
     in_memory = contents(folder / "out")
     pixels = []
-    real = read._read_pixels
-    monkeypatch.setattr(read, "_read_pixels", lambda frame: pixels.append(real(frame) or frame.renders.hr))
+    real = reading._read_pixels
+    monkeypatch.setattr(reading, "_read_pixels", lambda frame: pixels.append(real(frame) or frame.renders.hr))
     monkeypatch.setattr("oiio_msspl.image.arrays.MOST_PIXELS", 10)
     if place == "disk":
         monkeypatch.setattr(memory, "_vector_bytes", lambda render, channels: 1 << 32)
@@ -578,9 +579,9 @@ def test_large_frames_wait_in_temporary_files(shot, whole, bilinear_models, monk
     assert contents(shot / "on disk") == contents(shot / "whole")
     window = Window(0, 0, 4096, 2160)
     monkeypatch.undo()
-    assert memory_to_average(Reach(2, 2), window, 12, 2) < 1 << 30
-    assert memory_to_average(Reach(2, 2), Window(0, 0, 1920, 1080), 12, 2) < 1 << 29
-    assert memory_to_average(ALONE, window, 12, 2) == 0
+    assert sum(memory_to_average(Reach(2, 2), window, 12, 2)) < 1 << 30
+    assert sum(memory_to_average(Reach(2, 2), Window(0, 0, 1920, 1080), 12, 2)) < 1 << 29
+    assert sum(memory_to_average(ALONE, window, 12, 2)) == 0
 
 
 def test_the_number_of_frames_that_counted_is_a_layer(shot, bilinear_models):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputOptions, WriteOptions, fuse_shot
-from oiio_msspl.jobs import read
+from oiio_msspl.jobs import frame as reading
+from oiio_msspl.jobs.frame import read_frame
 from oiio_msspl.jobs.memory import ViewMemory
 from oiio_msspl.jobs.plan import ShotPlan, TemporalOptions, ViewPlan
-from oiio_msspl.jobs.read import read_frame
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Reach
 from tests.conftest import downsample, noisy, read_bits, rgb, same_bits, write_exr
@@ -247,7 +247,7 @@ def test_a_damaged_view_is_absent_wherever_renders_wait(tmp_path, bilinear_model
 
 def test_no_more_frames_are_held_than_are_counted(shot, bilinear_models, monkeypatch):
     held, most = [], []
-    real = read._read_pixels
+    real = reading._read_pixels
 
     def load(frame):
         real(frame)
@@ -255,7 +255,7 @@ def test_no_more_frames_are_held_than_are_counted(shot, bilinear_models, monkeyp
             held.append(weakref.ref(frame.renders.hr.layers["rgb"]))
             most.append((sum(pixels() is not None for pixels in held), 2 * frame.plan.reach.renders + 2))
 
-    monkeypatch.setattr(read, "_read_pixels", load)
+    monkeypatch.setattr(reading, "_read_pixels", load)
     for count in ("auto", "1"):
         most.clear()
         run(shot, bilinear_models[4], f"held {count}", temporal=count)

@@ -11,8 +11,8 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.image.colour import ACESCG, REC709, conversion
 from oiio_msspl.jobs.checks import check_first_pair
 from oiio_msspl.jobs.files import fuse_files
+from oiio_msspl.jobs.fitting import check_files
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
-from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import find_shot
 from tests.conftest import downsample, noisy, picture, rgb, write_exr
 from tests.shots import make_shot

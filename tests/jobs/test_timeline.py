@@ -139,7 +139,7 @@ def test_a_chunk_averages_the_frames_that_the_whole_shot_averages():
         part = Timeline(shot, chunk, reach)
         for number in chunk:
             for kind in ("renders", "results"):
-                assert part.around((number, None), kind) == whole.around((number, None), kind)
+                assert part.sides((number, None), kind) == whole.sides((number, None), kind)
 
 
 def test_at_the_end_nothing_is_needed():
@@ -171,14 +171,15 @@ def test_random_shots_settle_each_wanted_frame_once_and_never_lack_what_they_nee
     for number in order:
         renders |= {(number, view) for view in views} & timeline.needs_renders()
         for key in timeline.fusable(number):
-            assert renders >= {(n, key[1]) for n in (key[0], *timeline.around(key, "renders"))}
+            assert renders >= {(n, key[1]) for n in (key[0], *itertools.chain(*timeline.sides(key, "renders")))}
             assert key not in fused
             fused.add(key)
             pictures |= {key} & timeline.needs_pictures()
             timeline.fused(key)
         for frame in timeline.settled():
             for view in views:
-                assert pictures >= {(n, view) for n in (frame, *timeline.around((frame, view), "results"))}
+                around = itertools.chain(*timeline.sides((frame, view), "results"))
+                assert pictures >= {(n, view) for n in (frame, *around)}
             assert not timeline.waits(frame)
             settled.append(frame)
             pictures &= timeline.needs_pictures()

@@ -10,9 +10,8 @@ from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.inspection import inspect_file
 from oiio_msspl.jobs import files, run
-from oiio_msspl.jobs.inputs import map_pair
-from oiio_msspl.jobs.pair_check import check_files
-from oiio_msspl.jobs.views import find_other_views
+from oiio_msspl.jobs.fitting import check_files
+from oiio_msspl.jobs.inputs import find_views, map_pair
 from oiio_msspl.jobs.write import write_settled
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 
@@ -238,7 +237,7 @@ def test_a_full_name_in_a_mapping_means_its_own_view(tmp_path):
     for entry, first in (("fg.Denoising Albedo", "fg"), ("Denoising Albedo", "fg")):
         inputs = InputOptions({"albedo": entry})
         lr, hr = map_pair(*pair, inputs)
-        (other,) = find_other_views(lr, hr, inputs).views
+        (_, other), _ = find_views(lr, hr, inputs)
         assert hr.features["albedo"].text.startswith(first)
         assert other.hr.features["albedo"].text == "bg.Denoising Albedo"
 
@@ -260,8 +259,8 @@ def test_a_full_name_of_a_later_view_leaves_the_others_alone(tmp_path):
     )
     inputs = InputOptions({"albedo": "bg.paint"})
     low, high = map_pair(lr, hr, inputs)
-    others = [view.hr for view in find_other_views(low, high, inputs).views]
-    read = {each.view: each.features["albedo"].text for each in (high, *others)}
+    views, _ = find_views(low, high, inputs)
+    read = {view.hr.view: view.hr.features["albedo"].text for view in views}
     assert read == {"fg": "fg.Denoising Albedo", "bg": "bg.paint", "sky": "sky.Denoising Albedo"}
     assert inspect_file(hr, inputs).render.features["albedo"].text == "fg.Denoising Albedo"
     alone = map_pair(lr, hr, InputOptions({"albedo": "bg.paint"}, view="fg"))

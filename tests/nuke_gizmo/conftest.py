@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from msspl_cli.installed import find_msspl_fuse
+from msspl_cli.commands.nuke_install import find_msspl_fuse
 
 from tests.conftest import EXAMPLES
 from tests.nuke_gizmo.fake_nuke import FakeNuke

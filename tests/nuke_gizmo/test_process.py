@@ -12,7 +12,7 @@ import pytest
 from msspl_bridge import process
 from msspl_bridge.command import clean_environment
 from msspl_bridge.errors import FuseError
-from msspl_cli.installed import find_msspl_fuse
+from msspl_cli.commands.nuke_install import find_msspl_fuse
 
 
 class Window:

@@ -12,8 +12,7 @@ from msspl_cli import console, options
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
-    from oiio_msspl.jobs.pair_check import PairCheck
-    from oiio_msspl.jobs.shot_check import ShotCheck
+    from oiio_msspl.jobs.fitting import PairCheck, ShotCheck
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -44,9 +43,8 @@ def check(
     show the same frame: another camera, light, colour space, albedo or normal.
     Advice says what more would help, and what it costs.
     """
-    from oiio_msspl.jobs.pair_check import check_files
+    from oiio_msspl.jobs.fitting import check_files, check_shot
     from oiio_msspl.jobs.sequence import is_sequence
-    from oiio_msspl.jobs.shot_check import check_shot
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None, colorspace)
     lr, hr = options.low_and_high(renders)
@@ -77,7 +75,6 @@ def check(
 
 
 def _print(name: str, pair: PairCheck) -> None:
-    """Print the outcome of a pair."""
     if pair.problem is not None:
         console.say(f"{name}: can't be fused: {pair.problem}")
     else:

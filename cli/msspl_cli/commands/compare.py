@@ -113,7 +113,6 @@ def _layer(mapping: list[str]) -> str | None:
 
 
 def _print(images: list[Path], results: list[dict[str, float]]) -> None:
-    """Print the scores as a table."""
     rows = [("image", "PSNR", "RelMSE (0.5, 0.01)", "RelMSE (1, 1e-4)", "SSIM")]
     for path, scores in zip(images, results, strict=True):
         psnr, ssim = f"{scores['psnr']:.2f} dB", f"{scores['ssim']:.4f}"

@@ -212,7 +212,6 @@ def _fuse_shot(files: Files, scheduler: str | None, printer: ShotPrinter, **sett
 
 
 def _fuse_pair(files: Files, verbose: int, quiet: bool, as_json: bool, **settings: Any) -> None:
-    """Fuse a single frame, and print its report."""
     from oiio_msspl.jobs.files import fuse_files
 
     start = time.perf_counter()
@@ -269,7 +268,6 @@ def _print(report: FrameReport, seconds: float) -> None:
 
 
 def _device(report: FrameReport) -> str:
-    """Return where the model ran, in words."""
     provider = report.provider.removesuffix("ExecutionProvider")
     if provider == "CPU":
         return "on the CPU"

@@ -60,7 +60,6 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    """Return the line of a model in the table."""
     figures: dict[str, float] = row["measured"]
 
     def values(form: str, *names: str) -> str:

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import shutil
+import sysconfig
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from msspl_cli import options
-from msspl_cli.installed import find_msspl_fuse, shipped_folder
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import make_folder, replacing
 
@@ -38,9 +39,16 @@ def nuke_install(
 
     It adds one line to DIR/init.py, which names the gizmo's folder and msspl-fuse.
     """
+    package = Path(__file__).resolve().parents[1]
+    gizmo = package / "nuke_gizmo"
+    if not gizmo.is_dir():  # an editable installation has it in the source tree
+        gizmo = package.parents[1] / "nuke_gizmo"
     target = folder.expanduser() / "init.py"
-    line = None if uninstall else install_line(shipped_folder("nuke_gizmo"), find_msspl_fuse())
-    changed = set_line(target, line)
+    # A program that the environment or a knob names has priority.
+    program = find_msspl_fuse()
+    environment = f'os.environ.setdefault("MSSPL_FUSE", {Path(program).as_posix()!r}); ' if program else ""
+    line = f"import os, nuke; {environment}nuke.pluginAddPath({gizmo.as_posix()!r})  {MARKER}"
+    changed = set_line(target, None if uninstall else line)
     if uninstall:
         print(f"{target}: {'the line is taken out' if changed else 'there was no line of ours'}")
     else:
@@ -48,21 +56,15 @@ def nuke_install(
         print("Start Nuke: the node is in the toolbar under MSSPL.")
 
 
-def install_line(gizmo: Path, program: str | None) -> str:
-    """Build the line for init.py. A program that the environment or a knob names has priority."""
-    environment = f'os.environ.setdefault("MSSPL_FUSE", {Path(program).as_posix()!r}); ' if program else ""
-    return f"import os, nuke; {environment}nuke.pluginAddPath({gizmo.as_posix()!r})  {MARKER}"
+def find_msspl_fuse() -> str | None:
+    """Find msspl-fuse beside this Python, or else on the path: hosts seldom run in an activated environment."""
+    return shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or shutil.which("msspl-fuse")
 
 
 def set_line(path: Path, line: str | None) -> bool:
     """Make ``line`` our only line in a file, at its end. All other bytes stay.
 
-    Args:
-        path: init.py, which need not exist.
-        line: ends with ``MARKER``. None removes our line.
-
-    Returns:
-        Whether the file changed.
+    The file need not exist. The line ends with ``MARKER``; None removes it. Return whether the file changed.
 
     Raises:
         InputError: the folder is missing, or the file can't be read.

@@ -39,8 +39,6 @@ EXAMPLES = """[bold]Examples[/bold]
 
 #: Group of options in the help text.
 RENDER = "Render"
-#: Number and file of a frame. The number is None for the frame at which the scene was saved.
-Target = tuple[int | None, Path]
 
 _SCENE_NAME = "Render this scene, if the file has several. Without it: the one that was active when it was saved."
 _BLENDER = "Run this Blender (4.5 or later) or Python with bpy. Without it: MSSPL_BLENDER, or blender on the path."
@@ -191,11 +189,7 @@ def render(
 
 
 def _count_renders(renders: int | None, scale: int, lr_spp: int | None) -> int:
-    """Return how often a frame is rendered.
-
-    Raises:
-        InputError: there is no such scale, or the options do not fit together.
-    """
+    """Return how often a frame is rendered. Raise InputError if the options do not fit together."""
     from oiio_msspl.model.contract import ONE_SIZE, SCALES
 
     if scale not in (ONE_SIZE, *SCALES):
@@ -207,16 +201,8 @@ def _count_renders(renders: int | None, scale: int, lr_spp: int | None) -> int:
     return renders or (1 if scale == ONE_SIZE else 2)
 
 
-def name_targets(output: Path, frames: str | None) -> list[Target]:
-    """Pair frame numbers with files.
-
-    Args:
-        output: an EXR, or a pattern.
-        frames: a range; None for the frame at which the scene was saved.
-
-    Raises:
-        InputError: one name for several frames, a pattern without frames, or a name of another kind of file.
-    """
+def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Path]]:
+    """Pair frame numbers with files. The number is None without ``frames``: the frame at which the scene was saved."""
     from oiio_msspl.jobs.sequence import parse_frames, parse_pattern
 
     numbers = [] if frames is None else parse_frames(frames)

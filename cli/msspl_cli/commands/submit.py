@@ -16,8 +16,6 @@ from msspl_cli import console, options
 from msspl_cli.commands import fuse
 from msspl_cli.options import option
 
-USAGE = "[LR] HR -o OUT --bundle DIR [OPTION]..."
-
 EXAMPLES = """[bold]Examples[/bold]
 
   msspl submit lr/ hr/ -o out/ --bundle job/
@@ -109,19 +107,20 @@ def submit(
     temporal = TemporalOptions(given["temporal"], given["motion_format"])
     max_memory = bytes_of(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
-    settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view", "max_memory")}
-    settings |= {
-        "inputs": inputs,
-        "model": model,
-        "options": _passed_on(context, given),
-        "chunk": chunk,
-        "timeout": timeout,
-        "previews": given["preview"],
-        "name": name,
-        "command": command,
-        "packages": {key: wanted for key, wanted in (("conda", conda), ("rez", rez)) if wanted},
-    }
-    job = make_job(*options.low_and_high(given["renders"]), given["output"], **settings)
+    job = make_job(
+        *options.low_and_high(given["renders"]),
+        given["output"],
+        inputs=inputs,
+        model=model,
+        options=_passed_on(context, given),
+        chunk=chunk,
+        timeout=timeout,
+        previews=given["preview"],
+        name=name,
+        command=command,
+        packages={key: wanted for key, wanted in (("conda", conda), ("rez", rez)) if wanted},
+        **{name: given[name] for name in ("frames", "map_file", "device", "view", "max_memory")},
+    )
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
     with limit_threads(given["threads"]):
         check_temporal(job.shot, inputs, temporal, model, write)
@@ -143,6 +142,8 @@ def submit(
 
 def _passed_on(context: typer.Context, given: dict[str, Any]) -> list[str]:
     """Return the arguments that every task gets: those that are not the default of their option."""
+    from oiio_msspl.aovs.mapping import is_exr
+
     defaults = {name: parameter.default for name, parameter in inspect.signature(fuse.fuse).parameters.items()}
     arguments = []
     for parameter in context.command.params:
@@ -155,14 +156,9 @@ def _passed_on(context: typer.Context, given: dict[str, Any]) -> list[str]:
         elif name == "verbose":
             arguments += [parameter.opts[0]] * value
         else:
-            for text in value if isinstance(value, list | tuple) else [value]:
-                arguments += [parameter.opts[0], _full_path(text) if name == "mapping" else str(text)]
+            for text in map(str, value if isinstance(value, list | tuple) else [value]):
+                feature, _, layer = text.partition("=")
+                if name == "mapping" and is_exr(layer):  # tasks run in other folders
+                    text = f"{feature}={Path(layer).absolute()}"
+                arguments += [parameter.opts[0], text]
     return arguments
-
-
-def _full_path(mapping: str) -> str:
-    """Make the path of a ``--map`` absolute if it names an EXR, because tasks run in other folders."""
-    from oiio_msspl.aovs.mapping import is_exr
-
-    feature, equals, layer = mapping.partition("=")
-    return f"{feature}{equals}{Path(layer).absolute()}" if is_exr(layer) else mapping

@@ -15,12 +15,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.reader import use_threads
 from oiio_msspl.jobs.existing import ExistingResults
-from oiio_msspl.jobs.pipeline import run_pipeline
+from oiio_msspl.jobs.pipeline import Outcome, run_pipeline
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
@@ -72,17 +72,11 @@ def connect(scheduler: str) -> Client:
 
 def fuse_frames(
     client: Client, settings: Settings, plan: ShotPlan, frames: list[FrameFiles]
-) -> Iterator[tuple[FrameFiles, dict[str, Any] | Exception | None]]:
+) -> Iterator[tuple[FrameFiles, Outcome]]:
     """Fuse frames on the workers.
 
-    Args:
-        client: of the cluster, whose workers see the same files.
-        settings, plan: how frames are fused. Every worker gets them.
-        frames: the frames to fuse. They end in any order.
-
     Yields:
-        A frame as soon as it ends, with its report as a dict, the reason for its failure, or None if its EXR already
-        existed.
+        A frame as soon as it ends, in any order, with its outcome: None if its EXR already existed.
 
     Raises:
         InputError: there is no such model, or a worker takes several frames at a time.
@@ -119,7 +113,9 @@ def fuse_frames(
             failure: Exception | None = None
             try:
                 outcomes = dict(zip(chunk, future.result(), strict=True))
-                failed = [frame for frame, outcome in outcomes.items() if tries and _may_pass(outcome)]
+                # Another try may not meet the reason again, unless the files are it.
+                errors = [item for item in outcomes.items() if tries and isinstance(item[1], Exception)]
+                failed = [frame for frame, error in errors if not isinstance(error, InputError)]
                 if failed:
                     ended.add(submit(failed, tries - 1))
                 yield from (item for item in outcomes.items() if item[0] not in failed)
@@ -136,17 +132,8 @@ def fuse_frames(
         client.cancel(list(futures))
 
 
-def _may_pass(outcome: dict[str, Any] | Exception | None) -> bool:
-    """Return whether a frame has failed for a reason that another try may not meet."""
-    return isinstance(outcome, Exception) and not isinstance(outcome, InputError)
-
-
 def _most_workers_on_a_machine(client: Client) -> int:
-    """Return the largest number of workers that share the cores of one machine.
-
-    Raises:
-        InputError: a worker takes several frames at a time.
-    """
+    """Return how many workers share a machine at the most. Raise InputError if one takes several frames at a time."""
     if not client.scheduler_info()["workers"]:
         log.warning("%s has no workers yet; waiting for the first", client.scheduler.address)
         client.wait_for_workers(1)
@@ -166,9 +153,7 @@ def _sessions(run: str) -> dict[tuple[int, str | None], Session]:
     return {}
 
 
-def _fuse_chunk(
-    run: str, settings: Settings, plan: ShotPlan, frames: list[FrameFiles], workers: int
-) -> list[dict[str, Any] | Exception | None]:
+def _fuse_chunk(run: str, settings: Settings, plan: ShotPlan, frames: list[FrameFiles], workers: int) -> list[Outcome]:
     """Fuse frames in a worker, and return their outcomes as :func:`fuse_frames` does. ``workers`` share the cores."""
     from dask.system import CPU_COUNT
 
@@ -177,7 +162,7 @@ def _fuse_chunk(
     # skip_existing lets a frame replace the preview that a dead worker left without its EXR.
     settings = replace(settings, threads=threads, skip_existing=True, sessions=_sessions(run))
     existing = ExistingResults(settings, plan)
-    outcomes: dict[int, dict[str, Any] | Exception | None] = {}
+    outcomes: dict[int, Outcome] = {}
     # There was no EXR when the run began (or it may be replaced), so another try or another worker has written it.
     missing = [frame for frame in frames if not existing.has(frame)]
     if missing:

@@ -35,15 +35,10 @@ GRACE = 120
 GPUS = ("cuda", "tensorrt", "directml")
 #: Names of the job parameters by which the environments of a farm's queue install packages, by option.
 PACKAGES = {"conda": "CondaPackages", "rez": "RezPackages"}
-#: The most characters that the name of a job may have.
-_LONGEST_NAME = 128
-
-#: The most characters that a job parameter may have (Open Job Description 2023-09).
-_LONGEST = 1024
-
+#: The most characters that the name of a job, and a job parameter, may have (Open Job Description 2023-09).
+_LONGEST_NAME, _LONGEST = 128, 1024
 #: Files of a bundle. Deadline Cloud prescribes the first two names; ``openjd run`` reads the values from the third.
 TEMPLATE, VALUES, OPENJD_VALUES = "template.json", "parameter_values.json", "openjd_values.json"
-
 
 #: Job parameters of the renders, and what they are. One render is the last one.
 _RENDERS = (("LR", "Low-resolution, high-spp renders"), ("HR", "High-resolution, low-spp renders"))
@@ -155,7 +150,10 @@ def make_job(
     job = _describe(shot, renders, output, options, files, chunk, timeout)
     job.template["name"] = _literal(name or _name_of(shot))[:_LONGEST_NAME]
     _run_by(job, command, packages)
-    job.template["steps"][0]["hostRequirements"] = _requirements(device, memory)
+    amounts = [{"name": "amount.worker.memory", "min": -(-memory // 2**20)}]  # MiB, as much as a task may take
+    if device in GPUS:
+        amounts.append({"name": "amount.worker.gpu", "min": 1})
+    job.template["steps"][0]["hostRequirements"] = {"amounts": amounts}
     return job
 
 
@@ -189,14 +187,6 @@ def _run_by(job: Job, command: str, packages: Mapping[str, str]) -> None:
         job.values[PACKAGES[manager]] = wanted
 
 
-def _requirements(device: str, memory: int) -> dict[str, Any]:
-    """Return what a worker must have: as much memory as a task may take, and a GPU if the device is one."""
-    amounts = [{"name": "amount.worker.memory", "min": -(-memory // 2**20)}]  # MiB
-    if device in GPUS:
-        amounts.append({"name": "amount.worker.gpu", "min": 1})
-    return {"amounts": amounts}
-
-
 def _describe(
     shot: Shot,
     renders: Sequence[Path],
@@ -221,13 +211,12 @@ def _describe(
 
     def add_sequence(name: str, path: Path, is_folder: bool, what: str, flow: str) -> str:
         """Define two parameters, folder and pattern: a farm can copy a folder, but not a pattern."""
-        folder = str((path if is_folder else path.parent).absolute())
-        label = f"{what}: "
+        folder, file = (path, "") if is_folder else (path.parent, path.name)
         choose = {"type": "PATH", "objectType": "DIRECTORY", "dataFlow": flow}
-        directory = add(f"{name}Folder", folder, what, "CHOOSE_DIRECTORY", f"{label}folder", **choose)
+        place = str(folder.absolute())
+        directory = add(f"{name}Folder", place, what, "CHOOSE_DIRECTORY", f"{what}: folder", **choose)
         said = "Pattern in the folder; empty for all of it"
-        name_in_folder = "" if is_folder else path.name
-        pattern = add(f"{name}Name", name_in_folder, said, "LINE_EDIT", f"{label}files", type="STRING")
+        pattern = add(f"{name}Name", file, said, "LINE_EDIT", f"{what}: files", type="STRING")
         return f"{directory}/{pattern}"
 
     arguments = [
@@ -252,12 +241,8 @@ def _describe(
         arguments += [option, file]
     arguments += ["--frames", "{{Task.Param.Frame}}", "--update", "--progress", "openjd"]
     arguments += map(_literal, options)
-    task_frames = {
-        "name": "Frame",
-        "type": "CHUNK[INT]",
-        "range": frame_range,
-        "chunks": {"defaultTaskCount": size, "rangeConstraint": "NONCONTIGUOUS"},
-    }
+    chunks = {"defaultTaskCount": size, "rangeConstraint": "NONCONTIGUOUS"}
+    task_frames = {"name": "Frame", "type": "CHUNK[INT]", "range": frame_range, "chunks": chunks}
     command = {
         "command": "msspl-fuse",
         "args": arguments,

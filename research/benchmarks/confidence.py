@@ -63,7 +63,6 @@ def _cropped(image: Array) -> Array:
 
 
 def main() -> None:
-    """Measure a family of models at every scale."""
     parser = results.parser(__doc__)
     parser.add_argument("folder", type=Path, help="renders or views")
     parser.add_argument("--model", default="auto", help="a family of models")

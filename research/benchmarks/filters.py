@@ -96,7 +96,6 @@ def measure(views: list[SampleView], models: list[str]) -> Iterator[Row]:
 
 
 def main() -> None:
-    """Measure the held-out views of a folder."""
     parser = results.parser(__doc__)
     parser.add_argument("views", type=Path)
     parser.add_argument("--model", nargs="+", default=list(MODELS))

@@ -235,7 +235,6 @@ def rows_of(name: str, views: list[View], processes: int) -> list[results.Row]:
 
 
 def main() -> None:
-    """Check the pairs of a folder."""
     parser = results.parser(__doc__)
     parser.add_argument("frames", type=Path, metavar="FRAMES")
     parser.add_argument("--scenes", choices=SETS, default=SETS[0], help="which scenes these are (%(default)s)")

@@ -242,7 +242,6 @@ def check_casts(path: Path) -> None:
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--scale", type=int, nargs="+", help="scales to export, of a network for several")

@@ -61,7 +61,6 @@ def mean_model(path: Path) -> onnx.ModelProto:
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, help="file for CPUs of a joint model at x2 with a denoiser of its own")
     args = parser.parse_args()

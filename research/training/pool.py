@@ -275,7 +275,6 @@ class PooledBatches:
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, help="folder of training views")
     parser.add_argument("pool", type=Path, help="folder for the pairs")

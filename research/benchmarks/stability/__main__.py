@@ -81,7 +81,6 @@ def run(scale: int, methods: dict[str, Method], size: int) -> list[dict[str, Any
 
 
 def main() -> None:
-    """Measure the models of some scales."""
     parser = results.parser(__doc__)
     parser.add_argument("--model", action="append", default=[], help="ONNX file or shipped name; repeat it for more")
     parser.add_argument("--scale", type=int, nargs="+", choices=SCALES, default=[2, 4], help="default: 2 4")

@@ -11,7 +11,6 @@ from research.datagen import command_line, views
 
 
 def main() -> int:
-    """Run the command line and return the exit code."""
     parser = command_line.parser("research.datagen.cycles", "Render training views with Blender's Cycles.", ref_spp=32)
     parser.add_argument(
         "--filter",

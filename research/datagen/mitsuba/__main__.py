@@ -12,7 +12,6 @@ from . import start
 
 
 def main() -> int:
-    """Run the command line and return the exit code."""
     parser = command_line.parser("research.datagen.mitsuba", "Render training views with Mitsuba 3.", ref_spp=96)
     parser.add_argument(
         "--assets", type=Path, help="folder with hdri/ and models/; without it all content is procedural"

@@ -152,7 +152,6 @@ def render_scene(args: argparse.Namespace, assets: Assets, seed: int) -> tuple[i
 
 
 def main() -> int:
-    """Run the command line and return the exit code."""
     parser = command_line.parser(
         "research.datagen.mitsuba.render_samples", "Render training views that keep their samples.", ref_spp=48
     )

@@ -44,7 +44,7 @@ from research.benchmarks.accuracy import mean_flip
 from research.benchmarks.render.film import write_exr
 from research.benchmarks.render.own_scenes import GROUPS, SCENES, lamps
 from research.benchmarks.shots.measures import flicker, motion_error
-from research.datagen.mitsuba.start import start as start_mitsuba
+from research.datagen.mitsuba import start as start_mitsuba
 
 LAYERS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z")
 MOTION = ("motionFore.X", "motionFore.Y")

@@ -132,7 +132,7 @@ def test_a_reference_has_the_filter_of_the_samples(pixel_filter: PixelFilter) ->
 def test_splatting_is_what_mitsubas_film_does(pixel_filter: PixelFilter, plugin: dict) -> None:
     """The same samples, put into Mitsuba's image block with the same filter."""
     pytest.importorskip("mitsuba", reason="rendering views is optional")
-    from research.datagen.mitsuba.start import start
+    from research.datagen.mitsuba import start
 
     mi = start()
     place, values = _noise(k=4, size=32, channels=3)

@@ -141,11 +141,9 @@ def measure(case: str, samples: tuple[int, int]) -> Iterator[Row]:
 
 
 def main() -> None:
-    parser = results.parser(__doc__)
-    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=CASES, metavar="CASE")
-    args = parser.parse_args()
-    rows = [row for case in args.cases for samples in SAMPLES for row in measure(case, samples)]
-    results.show(rows, args.table, KEYS)
+    args = results.parser(__doc__).parse_args()
+    rows = [row for case in CASES for samples in SAMPLES for row in measure(case, samples)]
+    results.show(rows, args.table)
 
 
 if __name__ == "__main__":

@@ -49,8 +49,7 @@ SAME_WORK = {
     "OIDN prefiltered and split, same samples": OIDN_SPLIT,
 }
 #: Values of ``--temporal``: the first one is what the others are compared with.
-OFF = "off"
-WAYS = (OFF, "2", "auto")
+WAYS = ("off", "2", "auto")
 #: spp and scale with which rendering is timed.
 RENDER_SPP, RENDER_SCALE = 4, 4
 MEGAPIXEL = 1024 * 1024

@@ -6,7 +6,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -240,18 +240,14 @@ def overflow(size: int, scale: int) -> Iterator[Case]:
     yield Case("a frame that reaches 4 times the largest half", held, bright)
 
 
-def lights(size: int, scale: int) -> Iterator[Case]:
-    for radiance in (1e2, 1e4, 1e6):
-        made = Base(f"lights {radiance}", analytic.small_lights(size, radiance))
-        yield Case(f"small lights up to {radiance:.0e}".replace("e+0", "e"), made.pair(scale))
-    yield Case("visible emitters, one behind a grille", Base("emitters", analytic.emitters(size)).pair(scale))
+def hard(*scenes: tuple[str, str, Callable[[int], analytic.Scene]]) -> Callable[[int, int], Iterator[Case]]:
+    """Return the cases of scenes that are hard as they are: a name, a name that the noise follows from, the scene."""
 
+    def cases(size: int, scale: int) -> Iterator[Case]:
+        for name, base, scene in scenes:
+            yield Case(name, Base(base, scene(size)).pair(scale))
 
-def dark(size: int, scale: int) -> Iterator[Case]:
-    name = "1 sample of 200 finds the light"
-    yield Case(name, Base("near black", analytic.near_black(size)).pair(scale))
-    traces = Base("near black", analytic.near_black(size, 1e-3))
-    yield Case(f"{name}, traces of 1e-3 to 1e-40 elsewhere", traces.pair(scale))
+    return cases
 
 
 def rare_light(size: int, scale: int) -> Iterator[Case]:
@@ -263,16 +259,6 @@ def rare_light(size: int, scale: int) -> Iterator[Case]:
     dim = Base("dark room", analytic.dark_room(size))
     yield Case("a dark room at 1 spp", dim.pair(scale))
     yield Case("a dark room, 1 spp in both", dim.pair(scale, 1, 1))
-
-
-def blur(size: int, scale: int) -> Iterator[Case]:
-    yield Case("depth of field", Base("depth of field", analytic.defocused(size)).pair(scale))
-    yield Case("motion blur", Base("motion blur", analytic.moving(size)).pair(scale))
-
-
-def detail(size: int, scale: int) -> Iterator[Case]:
-    yield Case("hairs of 0.1 to 0.8 pixels", Base("hairs", analytic.hairy(size)).pair(scale))
-    yield Case("glass that no layer sees through", Base("glass", analytic.glassy(size)).pair(scale))
 
 
 def filters(size: int, scale: int) -> Iterator[Case]:
@@ -303,6 +289,7 @@ def disagreement(size: int, scale: int) -> Iterator[Case]:
         yield Case(f"shifted by {unit}, x and y", base.pair(scale, lr_scene=moved), clean)
 
 
+RARE = "1 sample of 200 finds the light"
 GROUPS: dict[str, Callable[[int, int], Iterator[Case]]] = {
     "fireflies": fireflies,
     "NaN, Inf, negative": broken_values,
@@ -314,12 +301,25 @@ GROUPS: dict[str, Callable[[int, int], Iterator[Case]]] = {
     "spp outside training": unusual_spp,
     "pixel footprint": footprints,
     "16-bit overflow": overflow,
-    "lights and emitters": lights,
-    "near-black": dark,
+    "lights and emitters": hard(
+        ("small lights up to 1e2", "lights 100.0", partial(analytic.small_lights, radiance=1e2)),
+        ("small lights up to 1e4", "lights 10000.0", partial(analytic.small_lights, radiance=1e4)),
+        ("small lights up to 1e6", "lights 1000000.0", partial(analytic.small_lights, radiance=1e6)),
+        ("visible emitters, one behind a grille", "emitters", analytic.emitters),
+    ),
+    "near-black": hard(
+        (RARE, "near black", analytic.near_black),
+        (f"{RARE}, traces of 1e-3 to 1e-40 elsewhere", "near black", partial(analytic.near_black, traces=1e-3)),
+    ),
     "rare light": rare_light,
     "pixel filter": filters,
-    "depth of field, motion blur": blur,
-    "hair, glass": detail,
+    "depth of field, motion blur": hard(
+        ("depth of field", "depth of field", analytic.defocused), ("motion blur", "motion blur", analytic.moving)
+    ),
+    "hair, glass": hard(
+        ("hairs of 0.1 to 0.8 pixels", "hairs", analytic.hairy),
+        ("glass that no layer sees through", "glass", analytic.glassy),
+    ),
     DISAGREE: disagreement,
 }
 """A group's name -> its cases, by the side of the frame in pixels and the scale."""

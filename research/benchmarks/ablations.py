@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -58,15 +59,11 @@ def _in_linear(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Te
     return lambda output, reference: loss(*(log_decode(values).clamp(0.0, CLIP) for values in (output, reference)))
 
 
-def _robust(beta: float) -> Callable[[Tensor, Tensor], Tensor]:
-    return lambda output, reference: losses.robust(output, reference, beta)
-
-
 VARIANTS = [
     Variant("both RGB, l1"),
     *(Variant(f"HRLS: {name}", hrls=name) for name in (NONE, *LAYERS) if name != COLOUR),
     *(Variant(f"LRHS: {name}", lrhs=name) for name in (NONE, ALL)),
-    *(Variant(f"robust loss, beta {beta:g}", loss=_robust(beta)) for beta in (0.01, 0.1, 1.0)),
+    *(Variant(f"robust loss, beta {beta:g}", loss=partial(losses.robust, beta=beta)) for beta in (0.01, 0.1, 1.0)),
     Variant("l1 of linear radiance", loss=_in_linear(losses.l1)),
     Variant("robust loss of linear radiance, beta 0.1", loss=_in_linear(losses.robust)),
 ]

@@ -175,7 +175,6 @@ def cell(measure: str, value: float) -> str:
 
 
 def main() -> None:
-    """Measure the scenes of a folder."""
     parser = results.parser(__doc__)
     parser.add_argument("folder", type=Path, help="renders or views")
     parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; default: all")

@@ -63,15 +63,13 @@ def _cropped(image: Array) -> Array:
 
 
 def main() -> None:
-    """Measure a family of models at every scale."""
     parser = results.parser(__doc__)
     parser.add_argument("folder", type=Path, help="renders or views")
-    parser.add_argument("--model", default="auto", help="a family of models")
     args = parser.parse_args()
     clean = [scene for scene in scenes.load(args.folder) if scene.name not in scenes.NOISY_REFERENCE]
     rows = []
     for scale in SCALES:
-        session = Session(find_model(scale, args.model))
+        session = Session(find_model(scale, "auto"))
         pairs = [errors(scene, session, spp) for scene in clean for spp in AVERAGES]
         rows.append(measure(session.contract.name, pairs))
     results.show(rows, args.table)

@@ -35,10 +35,6 @@ Y, X = np.mgrid[: SIDE * SUB, : SIDE * SUB].astype(np.float32) / SUB
 SHAPE = X.shape
 
 
-def _columns(*values: float) -> tuple[float, ...]:
-    return values
-
-
 def _grey(values: Array) -> Array:
     return values[..., None].astype(np.float32)
 
@@ -52,14 +48,14 @@ def display() -> Scene:
 def leather() -> Scene:
     """Return bumps that only the shading shows."""
     bumps = 1 + 0.3 * np.sin(X * 1.3 + 2 * np.sin(Y / 17)) * np.sin(Y * 1.1)
-    return Scene(surface(SHAPE, albedo=_columns(0.5, 0.35, 0.25), direct=_grey(0.6 * bumps), visible=1.0, ambient=0.1))
+    return Scene(surface(SHAPE, albedo=(0.5, 0.35, 0.25), direct=_grey(0.6 * bumps), visible=1.0, ambient=0.1))
 
 
 def shadows() -> Scene:
     """Return thin shadows, such as those of a grille."""
     lines = [((X * np.cos(a) + Y * np.sin(a)) % period) < 0.7 for a, period in ((0.2, 13), (1.3, 11), (2.1, 17))]
     shade = 1 - 0.9 * np.logical_or.reduce(lines)
-    return Scene(surface(SHAPE, albedo=_columns(0.7, 0.7, 0.7), direct=0.6, visible=_grey(shade), ambient=0.1))
+    return Scene(surface(SHAPE, albedo=(0.7, 0.7, 0.7), direct=0.6, visible=_grey(shade), ambient=0.1))
 
 
 def flakes() -> Scene:
@@ -68,7 +64,7 @@ def flakes() -> Scene:
     glints = np.where(rng.random(SHAPE) < 0.02, rng.exponential(4, SHAPE), 0.05)
     spot = np.exp(-((X - 128) ** 2 + (Y - 110) ** 2) / 2 / 55**2)
     emission = _grey(glints * spot) * np.array((0.9, 0.15, 0.1), np.float32)
-    return Scene(surface(SHAPE, albedo=_columns(0.5, 0.05, 0.04), ambient=0.2, emission=emission))
+    return Scene(surface(SHAPE, albedo=(0.5, 0.05, 0.04), ambient=0.2, emission=emission))
 
 
 def _points(count: int, size: int, brightest: float, seed: int) -> Array:
@@ -83,7 +79,7 @@ def _points(count: int, size: int, brightest: float, seed: int) -> Array:
 def stars() -> Scene:
     """Return a night sky."""
     sky = np.array((0.001, 0.0014, 0.0025), np.float32)
-    return Scene(surface(SHAPE, normal=_columns(0, 0, 0), emission=_points(700, 2, 60, 4) + sky))
+    return Scene(surface(SHAPE, normal=(0, 0, 0), emission=_points(700, 2, 60, 4) + sky))
 
 
 def lamps() -> Scene:
@@ -94,10 +90,8 @@ def lamps() -> Scene:
 
 def blue_lamp() -> Scene:
     """Return a wall lit by a blue lamp alone, which luminance hardly sees."""
-    wall = np.where((X // 32 + Y // 32) % 2 == 1, 0.6, 0.3)
-    return Scene(
-        surface(SHAPE, albedo=_grey(wall) * np.array((0, 0, 1), np.float32), direct=0.5, visible=0.6, ambient=0.1)
-    )
+    wall = _grey(np.where((X // 32 + Y // 32) % 2 == 1, 0.6, 0.3)) * np.array((0, 0, 1), np.float32)
+    return Scene(surface(SHAPE, albedo=wall, direct=0.5, visible=0.6, ambient=0.1))
 
 
 def painted_wall() -> Scene:
@@ -141,20 +135,15 @@ def measure(case: str, samples: tuple[int, int]) -> Iterator[Row]:
     for method, picture in pictures.items():
         image = picture()
         score = scores(image, truth)
-        yield {"case": case, "spp": f"{low_spp}-{high_spp}", "method": method, **results.model_of(method)} | {
-            "psnr": score["psnr"],
-            "relmse": score["relmse"],
-            "light": float(image.mean(dtype=np.float64) / truth.mean(dtype=np.float64)),
-        }
+        row: Row = {"case": case, "spp": f"{low_spp}-{high_spp}", "method": method, **results.model_of(method)}
+        row |= {"psnr": score["psnr"], "relmse": score["relmse"]}
+        yield row | {"light": float(image.mean(dtype=np.float64) / truth.mean(dtype=np.float64))}
 
 
 def main() -> None:
-    """Run the program."""
-    parser = results.parser(__doc__)
-    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=CASES, metavar="CASE")
-    args = parser.parse_args()
-    rows = [row for case in args.cases for samples in SAMPLES for row in measure(case, samples)]
-    results.show(rows, args.table, KEYS)
+    args = results.parser(__doc__).parse_args()
+    rows = [row for case in CASES for samples in SAMPLES for row in measure(case, samples)]
+    results.show(rows, args.table)
 
 
 if __name__ == "__main__":

@@ -78,9 +78,9 @@ def pair(view: SampleView, pixel_filter: PixelFilter, spp: int) -> tuple[Render,
     return renders[0], renders[1], reference * exposure
 
 
-def measure(views: list[SampleView], models: list[str]) -> Iterator[Row]:
+def measure(views: list[SampleView]) -> Iterator[Row]:
     """Yield a row for each filter, spp and method."""
-    sessions = {name: load_model(SCALE, name) for name in models}
+    sessions = {name: load_model(SCALE, name) for name in MODELS}
     for pixel_filter in FILTERS:
         way = "" if pixel_filter.splatted else ", importance sampled"
         kind = f"{pixel_filter.kind}, radius {pixel_filter.radius}{way}"
@@ -96,16 +96,14 @@ def measure(views: list[SampleView], models: list[str]) -> Iterator[Row]:
 
 
 def main() -> None:
-    """Measure the held-out views of a folder."""
     parser = results.parser(__doc__)
     parser.add_argument("views", type=Path)
-    parser.add_argument("--model", nargs="+", default=list(MODELS))
     args = parser.parse_args()
     folder = Folder(args.views)
     views = [view for split in ("validation", "test") for view in folder.sample_views(split)]
     if not views:
         raise SystemExit(f"{args.views}: no views with samples for validation or testing")
-    results.show(list(measure(views, args.model)), args.table)
+    results.show(list(measure(views)), args.table)
 
 
 if __name__ == "__main__":

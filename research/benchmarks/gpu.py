@@ -91,14 +91,10 @@ def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
         oidn_filter.commit()
         return oidn_filter
 
-    layers = ("albedo", "normal")
-    filters = []
-    if name == "OIDN prefiltered":
-        filters = [built({layer: layer}, f"clean {layer}") for layer in layers]
-        inputs = {layer: f"clean {layer}" for layer in layers}
-    else:
-        inputs = {layer: layer for layer in layers}
-    filters.append(built({"color": "color", **inputs}, "result", hdr=True, cleanAux=bool(filters)))
+    clean = "clean " if name == "OIDN prefiltered" else ""
+    layers = {layer: clean + layer for layer in ("albedo", "normal")}
+    filters = [built({layer: layer}, result) for layer, result in layers.items() if clean]
+    filters.append(built({"color": "color", **layers}, "result", hdr=True, cleanAux=bool(clean)))
 
     def run() -> None:
         for oidn_filter in filters:
@@ -111,7 +107,6 @@ def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure both sizes."""
     args = results.parser(__doc__).parse_args()
     import torch
 

@@ -134,14 +134,11 @@ def _summary(column: Column, rows: Sequence[Row]) -> str:
         return column.form.format(sum(columns[0]) / sum(columns[1]))
     functions: dict[str, Callable[[list[float]], Any]] = {"mean": np.mean, "sum": np.sum, "max": np.max}
     reduced = functions[column.how]
-    values = [float(reduced(values)) for values in columns]
-    return " / ".join(_format(column, name, value) for name, value in zip(_measures(column), values, strict=True))
-
-
-def _format(column: Column, measure: str, value: float) -> str:
-    if measure not in accuracy.MEASURES or column.form:
-        return (column.form or "{:.2f}").format(value)
-    return accuracy.cell(measure, value)
+    cells = []
+    for measure, values in zip(_measures(column), columns, strict=True):
+        value, known = float(reduced(values)), measure in accuracy.MEASURES and not column.form
+        cells.append(accuracy.cell(measure, value) if known else (column.form or "{:.2f}").format(value))
+    return " / ".join(cells)
 
 
 def _comparison(column: Column, pairs: Sequence[tuple[Row, Row]]) -> str:

@@ -11,7 +11,6 @@ mean of both, weighted by their spp.
 
 from __future__ import annotations
 
-import argparse
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -72,9 +71,7 @@ def _of_one_size(lr: ReadableRender, hr: ReadableRender, share: float | None = N
         yield f"{quality}-x1", session.name, partial(_fused, lr, hr, session, share)
 
 
-@functools.cache
-def _loaded(scale: int, name: str) -> Session:
-    return load_model(scale, name)
+_loaded = functools.cache(load_model)
 
 
 def _fused(lr: ReadableRender, hr: ReadableRender, session: Session, share: float | None = None) -> Array:
@@ -100,12 +97,11 @@ def _two(text: str) -> tuple[int, int]:
 
 
 def main() -> None:
-    """Measure the scenes of a folder."""
     parser = results.parser(__doc__)
     parser.add_argument("folder", type=Path, help="renders")
     parser.add_argument("--one", type=int, nargs="*", default=[], metavar="SPP", help="of one render, and of a pair")
     parser.add_argument("--two", type=_two, nargs="*", default=[], metavar="SPP:SPP", help="of two renders of one size")
-    args: argparse.Namespace = parser.parse_args()
+    args = parser.parse_args()
     results.show(with_means(measure(args.folder, args.one, args.two)), args.table, KEYS)
 
 

@@ -44,7 +44,7 @@ from research.benchmarks.accuracy import mean_flip
 from research.benchmarks.render.film import write_exr
 from research.benchmarks.render.own_scenes import GROUPS, SCENES, lamps
 from research.benchmarks.shots.measures import flicker, motion_error
-from research.datagen.mitsuba.start import start as start_mitsuba
+from research.datagen.mitsuba import start as start_mitsuba
 
 LAYERS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z")
 MOTION = ("motionFore.X", "motionFore.Y")
@@ -188,9 +188,8 @@ def measure(folder: Path, done: set[Any], key: tuple[str, str, int], python: str
     fuse = shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or "msspl-fuse"
     parts = ("full",) if spp == 1 else ("lr", "hr")
     inputs = [str(renders / f"{part}{'.####' if is_shot else ''}.exr") for part in parts]
-    oidn_methods = {
-        f"OIDN {oidn_version(python)} {name}": part for name, part in OIDN.items() if part in (*parts, "full")
-    }
+    version = oidn_version(python)
+    oidn_methods = {f"OIDN {version} {name}": part for name, part in OIDN.items() if part in (*parts, "full")}
     for method in (*QUALITIES, *oidn_methods):
         if (*key, method) in done:
             continue
@@ -225,10 +224,7 @@ def _scores(folder: Path, target: Path) -> dict[str, float]:
     """Return the mean scores of the results in a folder; for a shot also how it differs from frame to frame."""
     references = [_pixels(path) for path in sorted(folder.glob("ref*.exr"))]
     images = [_pixels(path) for path in sorted(target.glob("out*.exr"))]
-    rows = [
-        scores(image, reference) | {"flip": mean_flip(image, reference)}
-        for image, reference in zip(images, references, strict=True)
-    ]
+    rows = [scores(*pair) | {"flip": mean_flip(*pair)} for pair in zip(images, references, strict=True)]
     means = {name: float(np.mean([row[name] for row in rows])) for name in ("psnr", "relmse", "flip")}
     if len(images) > 1:
         shown, truth = srgb(np.stack(images)), srgb(np.stack(references))

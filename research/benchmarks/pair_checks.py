@@ -77,17 +77,6 @@ class Pair:
     lrhs: Layers
     hrls: Layers
 
-    @property
-    def exact(self) -> bool:
-        """Whether an LRHS pixel is exactly as wide and high as so many HRLS pixels: no odd size was rounded."""
-        low, high = self.lrhs[RGB].shape, self.hrls[RGB].shape
-        return low[:2] == (high[0] / self.scale, high[1] / self.scale)
-
-    @property
-    def equal_samples(self) -> bool:
-        """Whether both renders have the same number of samples for an area, and 1 spp in the HRLS."""
-        return self.hr_spp == 1 and self.lr_spp == self.scale**2
-
     def quarters(self) -> Iterator[Pair]:
         """Yield the four quarters of the frame."""
         height, width, s = (*(n // 2 for n in self.lrhs[RGB].shape[:2]), self.scale)
@@ -209,11 +198,12 @@ def measure(view: View, stranger: View) -> list[tuple[str, list[str]]]:
         if not pair.hrls[RGB].any():
             continue  # the camera is inside a wall
         check(RIGHT, pair)
-        if not pair.exact:
-            continue
+        low, high = pair.lrhs[RGB].shape, pair.hrls[RGB].shape
+        if low[:2] != (high[0] / pair.scale, high[1] / pair.scale):
+            continue  # an odd size was rounded
         for quarter in pair.quarters():
             check(RIGHT_QUARTER, quarter)
-        if pair.equal_samples:
+        if pair.hr_spp == 1 and pair.lr_spp == pair.scale**2:
             following = view.layers("next_1spp") if (view.folder / "next_1spp.exr").exists() else None
             for kind, wrong in wrong_pairs(pair, stranger, following):
                 check(kind, wrong)
@@ -235,7 +225,6 @@ def rows_of(name: str, views: list[View], processes: int) -> list[results.Row]:
 
 
 def main() -> None:
-    """Check the pairs of a folder."""
     parser = results.parser(__doc__)
     parser.add_argument("frames", type=Path, metavar="FRAMES")
     parser.add_argument("--scenes", choices=SETS, default=SETS[0], help="which scenes these are (%(default)s)")

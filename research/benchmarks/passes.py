@@ -206,7 +206,6 @@ def means(rows: list[Row]) -> list[Row]:
 
 
 def main() -> None:
-    """Measure scenes."""
     parser = results.parser(__doc__)
     parser.add_argument("passes", type=Path)
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")

@@ -49,8 +49,7 @@ SAME_WORK = {
     "OIDN prefiltered and split, same samples": OIDN_SPLIT,
 }
 #: Values of ``--temporal``: the first one is what the others are compared with.
-OFF = "off"
-WAYS = (OFF, "2", "auto")
+WAYS = ("off", "2", "auto")
 #: spp and scale with which rendering is timed.
 RENDER_SPP, RENDER_SCALE = 4, 4
 MEGAPIXEL = 1024 * 1024
@@ -78,23 +77,14 @@ def pair(height: int, width: int, scale: int) -> tuple[Any, Any]:
 
 def write_pair(folder: Path, width: int, height: int, scale: int) -> tuple[Path, Path]:
     """Write both renders as half-float EXRs; return their paths."""
-    import OpenEXR
-
-    from oiio_msspl.image.arrays import planes_of
     from oiio_msspl.image.filters import box_downsample
+    from research.benchmarks.shots.moving_wall import write_layers
 
     paths = folder / "lr.exr", folder / "hr.exr"
     for path, factor, seed in zip(paths, (scale, 1), (1, 0), strict=True):
         pixels = frame(height, width, seed)
         layers = {"": pixels["rgb"], "albedo": pixels["albedo"], "N": pixels["normal"]}
-        channels = {
-            f"{layer}.{component}".lstrip("."): np.ascontiguousarray(plane, np.float16)
-            for layer, image in layers.items()
-            for component, plane in zip("RGB", planes_of(box_downsample(image, factor)), strict=True)
-        }
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        with OpenEXR.File(header, channels) as file:
-            file.write(str(path))
+        write_layers(path, {name: (box_downsample(image, factor), "RGB") for name, image in layers.items()})
     return paths
 
 
@@ -229,7 +219,6 @@ QUESTIONS = {
 
 
 def main() -> None:
-    """Measure one question."""
     parser = results.parser(__doc__)
     parser.add_argument("question", choices=QUESTIONS)
     parser.add_argument("scenes", type=Path, nargs="?", help="render: the folder of scenes")

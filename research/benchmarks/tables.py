@@ -21,21 +21,13 @@ from typing import Any
 
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import ONE_SIZE, SPREAD
-from research.benchmarks import detail, paper, passes, results, runtime
+from research.benchmarks import detail, passes, results, runtime
 from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label
 from research.benchmarks.one_size import SEEDS
 from research.benchmarks.results import MEAN, Row
 from research.benchmarks.runtime import SAME_WORK
 from research.benchmarks.scenes import NOISY_REFERENCE
-from research.benchmarks.shots.methods import (
-    ALONE,
-    NEIGHBOURS,
-    OIDN_BEST,
-    OIDN_NEIGHBOURS,
-    OIDN_SPLIT,
-    OIDN_SPLIT_NEIGHBOURS,
-    QUALITIES,
-)
+from research.benchmarks.shots import methods as shots
 
 ROOT = Path(__file__).parents[2]
 
@@ -67,6 +59,8 @@ METHODS = {
     JOINED: "OIDN on both renders, prefiltered, and joined",
     SAME_SAMPLES: "OIDN at full resolution, prefiltered",
     "paper-x2": "`--model paper`",
+    "balanced-x1": "`--quality balanced`",
+    "best-x1": "`--quality best`",
 }
 SCENES = (MEAN, "cornell-box", "lamp", "spaceship", "staircase2", "tire", *NOISY_REFERENCE)
 #: Pixel filters, the spread ones first.
@@ -84,38 +78,30 @@ PAIRS = (
     "LRHS scaled down: lanczos3",
     "exposure one stop up",
 )
-NEEDS = {ON_HRLS: "HRLS", SAME_SAMPLES: "one render with all samples"}
-
-
-#: Method of :mod:`research.benchmarks.one_size` -> the model whose time is measured.
-ON_ONE_RENDER = {"balanced-x1": "joint-x1", "best-x1": "joint-large-x1"}
+PAIR, ALL_SAMPLES = "LRHS and HRLS", "one render with all samples"
+#: Table and method of a line of `WHEN_IT_PAYS` -> what it needs.
+NEEDS = {
+    ("accuracy", BALANCED): PAIR,
+    ("accuracy", BEST): PAIR,
+    ("one_size", "balanced-x1"): ALL_SAMPLES,
+    ("one_size", "best-x1"): ALL_SAMPLES,
+    ("accuracy", ON_HRLS): "HRLS",
+    ("accuracy", SAME_SAMPLES): ALL_SAMPLES,
+}
+#: Method of the tables of accuracy -> the one whose time is measured.
+TIMED = SAME_WORK | {"balanced-x1": "joint-x1", "best-x1": "joint-large-x1"}
+OF_COMMAND = {"source": "time_command", "size": "1920x1080"}
 WHEN_IT_PAYS = Table(
     ("accuracy", "one_size", "time_command"),
     (*BY_SCENE, "size"),
     ("method", "needs"),
-    [
-        *(
-            Line([METHODS[m], NEEDS.get(m, "LRHS and HRLS")], {"source": "accuracy", "method": m})
-            for m in (BALANCED, BEST)
-        ),
-        *(
-            Line([f"`--quality {m.removesuffix('-x1')}`", NEEDS[SAME_SAMPLES]], {"source": "one_size", "method": m})
-            for m in ON_ONE_RENDER
-        ),
-        *(Line([METHODS[m], NEEDS[m]], {"source": "accuracy", "method": m}) for m in (ON_HRLS, SAME_SAMPLES)),
-    ],
+    [Line([METHODS[m], needs], {"source": source, "method": m}) for (source, m), needs in NEEDS.items()],
     [
         *(
             Column(f"{title}, {spp} spp", title.lower(), {"scene": MEAN, "spp": spp})
             for title, spp in itertools.product(("PSNR", "RelMSE"), (2, 8))
         ),
-        Column(
-            "seconds of the whole command, 1080p, 2 cores",
-            "seconds",
-            {"source": "time_command", "size": "1920x1080"},
-            form="{:.0f}",
-            renamed=SAME_WORK | ON_ONE_RENDER,
-        ),
+        Column("seconds of the whole command, 1080p, 2 cores", "seconds", OF_COMMAND, form="{:.0f}", renamed=TIMED),
     ],
 )
 
@@ -152,12 +138,9 @@ SAMPLE_COUNTS = Table(
     [Line([METHODS[method]], {"method": method, "scene": MEAN}) for method in (BALANCED, BEST, ON_HRLS, SAME_SAMPLES)],
     [
         Column(
-            f"{spp} spp, {more}:{less}",
-            "psnr",
-            {"spp": spp},
-            renamed={m: f"{m}, {more}:{less}" for m in METHODS if more > 1},
+            f"{spp} spp, {share}", "psnr", {"spp": spp}, renamed={m: f"{m}, {share}" for m in METHODS if share != "1:1"}
         )
-        for spp, more, less in ((4, 1, 1), (4, 3, 1), (8, 1, 1), (8, 3, 1), (8, 7, 1))
+        for spp, share in ((4, "1:1"), (4, "3:1"), (8, "1:1"), (8, "3:1"), (8, "7:1"))
     ],
 )
 
@@ -183,14 +166,9 @@ SPREAD_NOISE = Table(
     BY_SCENE,
     ("method",),
     [
-        Line([title], {"method": method})
-        for method, title in {
-            f"joint-small{SPREAD}-x2": "`--quality fast`",
-            f"joint{SPREAD}-x2": "`--quality balanced`",
-            f"joint-large{SPREAD}-x2": "`--quality best`",
-            SAME_SAMPLES: METHODS[SAME_SAMPLES],
-            "OIDN prefiltered and split, same samples": "the call above on every second pixel",
-        }.items()
+        *(Line([METHODS[m]], {"method": m.replace("-x2", f"{SPREAD}-x2")}) for m in (FAST, BALANCED, BEST)),
+        Line([METHODS[SAME_SAMPLES]], {"method": SAME_SAMPLES}),
+        Line(["the call above on every second pixel"], {"method": "OIDN prefiltered and split, same samples"}),
     ],
     [Column(f"{spp} spp: PSNR / RelMSE", "psnr/relmse", {"scene": MEAN, "spp": spp}) for spp in (2, 8)],
     means=True,
@@ -236,25 +214,26 @@ GPU_TIMES = Table(
 
 
 def _alone(row: Row) -> dict[str, str]:
-    return {"method": row["method"].replace(NEIGHBOURS, ALONE)}
+    return {"method": row["method"].replace(shots.NEIGHBOURS, shots.ALONE)}
 
 
 def _oidn(row: Row) -> dict[str, Any]:
-    return {"method": OIDN_SPLIT if row["source"] == "shots_spread" else OIDN_BEST, "scale": 1}
+    return {"method": shots.OIDN_SPLIT if row["source"] == "shots_spread" else shots.OIDN_BEST, "scale": 1}
 
 
 def _averaged_oidn(row: Row) -> dict[str, Any]:
-    method = OIDN_SPLIT_NEIGHBOURS if row["source"] == "shots_spread" else OIDN_NEIGHBOURS
-    return {"method": method, "scale": max(int(row["scale"]), 2)}  # an LRHS tests the light of its frames
+    # At scale 1, an LRHS still tests the light of OIDN's frames.
+    return {"method": f"{_oidn(row)['method']}, {shots.NEIGHBOURS}", "scale": max(int(row["scale"]), 2)}
 
 
 def _shot_lines(source: str, title: str, scales: Sequence[int]) -> list[Line]:
+    wanted = {"source": source}
     return [
         Line(
             [f"`--quality {q}`, {'one render' if scale == ONE_SIZE else f'x{scale}'}{title}"],
-            {"source": source, "method": prefix + NEIGHBOURS, "scale": scale},
+            wanted | {"method": prefix + shots.NEIGHBOURS, "scale": scale},
         )
-        for (q, prefix), scale in itertools.product(QUALITIES.items(), scales)
+        for (q, prefix), scale in itertools.product(shots.QUALITIES.items(), scales)
     ]
 
 
@@ -337,6 +316,7 @@ PAIR_CHECKS = Table(
     ],
 )
 
+WORST_TENTH = "the tenth of the pixels with the largest prediction"
 CONFIDENCE = Table(
     ("confidence",),
     ("method",),
@@ -345,9 +325,7 @@ CONFIDENCE = Table(
     [
         Column("predicted error, log-encoded", "predicted", form="{:.4f}"),
         Column("actual error", "actual", form="{:.4f}"),
-        Column(
-            "share of the error in the tenth of the pixels with the largest prediction", "worst_tenth", form="{:.0%}"
-        ),
+        Column(f"share of the error in {WORST_TENTH}", "worst_tenth", form="{:.0%}"),
         Column("correlation of logarithms, 8 x 8 pixels", "correlation"),
     ],
 )
@@ -378,6 +356,44 @@ ONE_RENDER_OR_TWO = Table(
     [Column(name, "psnr", {"scene": name}) for name in SCENES if name not in NOISY_REFERENCE],
 )
 
+#: The row of :mod:`research.benchmarks.ablations` that several findings need.
+RGB = "both RGB, l1"
+#: A finding of the paper -> rows of :mod:`research.benchmarks.ablations` from worse to better. The paper's data was
+#: never published, so only the order of its values and ours can be compared.
+ABLATIONS = {
+    "an HRLS beats super-resolution (table 5): none, RGB": ("HRLS: none", RGB),
+    "further layers of the HRLS help: RGB, all": (RGB, "HRLS: and diffuse, specular"),
+    "further layers of the LRHS do not help: all, RGB": ("LRHS: and diffuse, specular", RGB),
+    "on linear radiance the robust loss is better: l1, robust": (
+        "l1 of linear radiance",
+        "robust loss of linear radiance, beta 0.1",
+    ),
+    "a beta of 0.1 is best for it: 1, 0.1": ("robust loss, beta 1", "robust loss, beta 0.1"),
+}
+
+
+def verdict(rows: Sequence[Row]) -> str:
+    """Say whether rows get better from one to the next: PSNR must rise, and RelMSE must fall."""
+    agrees = [all(before["psnr"] < after["psnr"] for before, after in itertools.pairwise(rows))]
+    agrees.append(all(before["relmse"] > after["relmse"] for before, after in itertools.pairwise(rows)))
+    return "agrees" if all(agrees) else "PSNR and RelMSE disagree" if any(agrees) else "**differs**"
+
+
+def findings() -> str:
+    """Lay out what the paper finds, and whether our figures agree."""
+    ablated = results.index(results.read("ablations"), "name")
+    means = results.index(results.where(results.read("accuracy"), scene=MEAN), "spp", "method")
+    cases = {finding: [ablated[name] for name in names] for finding, names in ABLATIONS.items()}
+    cases["x4 is best at 2 spp (table 2): x2, x4"] = [means[2, "paper-x2"], means[2, "paper-x4"]]
+    cases["x2 is best at 8 spp (table 2): x4, x2"] = [means[8, "paper-x4"], means[8, "paper-x2"]]
+    body = []
+    for finding, rows in cases.items():
+        relmse = ", ".join(f"{row['relmse']:.4f}" for row in rows)
+        body.append([finding, ", ".join(f"{row['psnr']:.2f}" for row in rows), relmse, verdict(rows)])
+    table = results.markdown(["the paper finds", "PSNR here", "RelMSE here", "our figures"], body)
+    return f"{table}\n{results.stamp_note(row for rows in cases.values() for row in rows)}\n"
+
+
 Block = Table | Callable[[], str]
 TABLES: dict[Path, dict[str, Block]] = {
     ROOT / "README.md": {"when_it_pays": WHEN_IT_PAYS},
@@ -395,27 +411,22 @@ TABLES: dict[Path, dict[str, Block]] = {
         "stability": STABILITY,
         "pair_checks": PAIR_CHECKS,
         "confidence": CONFIDENCE,
-        "paper": paper.findings,
+        "paper": findings,
     },
     ROOT / "docs/guide/gpu.md": {"gpu_times": GPU_TIMES},
-    ROOT / "docs/design/temporal.md": {
-        "temporal_time": TIME_OF_SHOTS,
-    },
+    ROOT / "docs/design/temporal.md": {"temporal_time": TIME_OF_SHOTS},
 }
 
 
 def measured_models() -> str:
     """Return the table of :func:`oiio_msspl.model.catalogue.measured`, which ``msspl models`` prints."""
-    sets = {"": "accuracy", SPREAD: "accuracy_gauss"}
-    means = {
-        noise: results.index(results.where(results.read(table), scene=MEAN), "spp", "method")
-        for noise, table in sets.items()
-    }
+    sets = [results.where(results.read(table), scene=MEAN) for table in ("accuracy", "accuracy_gauss")]
+    means = [results.index(rows, "spp", "method") for rows in sets]
     times = results.read("time_frame")
     runs = [results.index(results.where(times, **_on(ending)), "method") for ending in MACHINES.values()]
     lines = [",".join(["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp", *(f"time_{x.lower()}" for x in MACHINES)])]
     for name in shipped_models():
-        rows = [means[SPREAD if f"{SPREAD}-x" in name else ""].get((spp, name)) for spp in (2, 8)]
+        rows = [means[f"{SPREAD}-x" in name].get((spp, name)) for spp in (2, 8)]
         cells = [f"{row[m]:.4g}" if row else "" for row in rows for m in ("psnr", "relmse")]
         cells += [f"{run[name]['seconds'] / run[runtime.OIDN]['seconds']:.3g}" if name in run else "" for run in runs]
         lines.append(",".join([name, *cells]))
@@ -438,7 +449,6 @@ def laid_out(page: str, blocks: Mapping[str, Block]) -> str:
 
 
 def main() -> None:
-    """Write the tables, or check them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing; fail if a page is out of date")
     args = parser.parse_args()

@@ -37,11 +37,6 @@ class Function:
     repeats: int = 1
     """Calls that are timed, after one that warms up."""
 
-    def command(self) -> list[str]:
-        """Return the command that runs it."""
-        module = [sys.executable, "-m", "research.benchmarks.timer"]
-        return [*module, self.name, str(self.repeats), json.dumps(self.arguments)]
-
 
 @dataclass(frozen=True)
 class Run:
@@ -68,7 +63,11 @@ def in_turn(jobs: Mapping[Any, Function | Sequence[str]], rounds: int) -> dict[A
 
 def run(job: Function | Sequence[str]) -> Run:
     """Run one job in a fresh process."""
-    command = job.command() if isinstance(job, Function) else list(job)
+    if isinstance(job, Function):
+        timed = [job.name, str(job.repeats), json.dumps(job.arguments)]
+        command = [sys.executable, "-m", "research.benchmarks.timer", *timed]
+    else:
+        command = list(job)
     with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
         start = time.perf_counter()
         process = subprocess.Popen(command, stdout=output, stderr=errors)

@@ -14,6 +14,8 @@ from pathlib import Path
 
 #: Rendering stops when the disk has fewer bytes left.
 MIN_FREE = 15 * 2**30
+#: Help of the option that the renderers with Mitsuba have.
+ASSETS = "folder with hdri/ and models/; without it all content is procedural"
 
 
 def _seeds(text: str) -> range:

@@ -126,12 +126,16 @@ def surface(points: np.ndarray, uv: np.ndarray) -> Mesh:
     normal = unit(np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0)))
     i = (np.arange(a - 1)[:, None] * b + np.arange(b - 1)).ravel()
     f = np.concatenate([np.stack([i, i + 1, i + b], 1), np.stack([i + 1, i + b + 1, i + b], 1)])
-    # Each triangle winds the way its vertex normals point: glass needs to know inside from outside.
-    v, n = points.reshape(-1, 3), normal.reshape(-1, 3)
+    return _wound(Mesh(points.reshape(-1, 3), f, uv.reshape(-1, 2)), normal.reshape(-1, 3))
+
+
+def _wound(mesh: Mesh, normals: np.ndarray) -> Mesh:
+    """Set normals, and wind each triangle the way they point: glass needs to know inside from outside."""
+    v, f, mesh.n = mesh.v, mesh.f, normals
     facing = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
-    flip = (facing * n[f].sum(1)).sum(1) < 0
+    flip = (facing * normals[f].sum(1)).sum(1) < 0
     f[flip] = f[flip][:, [0, 2, 1]]
-    return Mesh(v, f, uv.reshape(-1, 2), n)
+    return mesh
 
 
 def lathe(profile: np.ndarray, sides: int = 48) -> Mesh:
@@ -145,11 +149,7 @@ def lathe(profile: np.ndarray, sides: int = 48) -> Mesh:
     # At the seam and at the poles grid differences fail: take the profile's own normal instead.
     t = np.gradient(profile, axis=0)
     n = unit(np.stack([t[:, 1:] * np.cos(angle), t[:, 1:] * np.sin(angle), -t[:, :1] + 0 * angle], axis=-1))
-    mesh.n = n.reshape(-1, 3)
-    facing = np.cross(*(mesh.v[mesh.f[:, k]] - mesh.v[mesh.f[:, 0]] for k in (1, 2)))
-    flip = (facing * mesh.n[mesh.f].sum(1)).sum(1) < 0
-    mesh.f[flip] = mesh.f[flip][:, [0, 2, 1]]
-    return mesh
+    return _wound(mesh, n.reshape(-1, 3))
 
 
 def sphere(radius: float, sides: int = 40) -> Mesh:

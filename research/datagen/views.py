@@ -159,22 +159,28 @@ def map_npz(path: Path) -> dict[str, NDArray]:
     return arrays
 
 
-class View:
-    """One rendered view; its arrays stay on disk.
+class StoredView:
+    """The file of a view; its arrays stay on disk.
 
     Raises:
         ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile: the file is incomplete or no view.
     """
 
     def __init__(self, path: Path) -> None:
-        arrays = map_npz(path)
-        meta = json.loads(str(arrays["meta"]))
-        self.path = path
-        self.meta: dict[str, Any] = meta
-        self.split: str = meta["split"]
-        self.scene: str = str(meta["seed"])
-        self.source: str = f"{meta.get('renderer', 'unknown renderer')}, generator {meta.get('generator', '?')}"
+        self.path, self.arrays = path, map_npz(path)
+        self.meta: dict[str, Any] = json.loads(str(self.arrays["meta"]))
+        self.split: str = self.meta["split"]
+        self.scene: str = str(self.meta["seed"])
+        self.source = f"{self.meta.get('renderer', 'unknown renderer')}, generator {self.meta.get('generator', '?')}"
         """Renderer and generator version, for the provenance of a model."""
+
+
+class View(StoredView):
+    """One rendered view with passes."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        arrays = self.arrays
         self.hr, self.ref = arrays["hr"], arrays["ref"]
         self.lr: dict[int, NDArray] = {scale: arrays[key] for scale in (1, *SCALES) if (key := lr_key(scale)) in arrays}
         """LRHS passes by scale: scale 1 alone, or all other scales."""
@@ -192,21 +198,11 @@ class View:
             raise ValueError(f"{path}: hr is {self.hr.shape}, lr {shapes}, lr_spp {self.lr_spp.shape}")
 
 
-class SampleView:
-    """One view with single samples, see :mod:`research.datagen.samples`; its arrays stay on disk.
-
-    Raises:
-        ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile: the file is incomplete or no view.
-    """
+class SampleView(StoredView):
+    """One view with single samples, see :mod:`research.datagen.samples`."""
 
     def __init__(self, path: Path) -> None:
-        self.arrays = map_npz(path)
-        self.path = path
-        self.meta: dict[str, Any] = json.loads(str(self.arrays["meta"]))
-        self.split: str = self.meta["split"]
-        self.scene: str = str(self.meta["seed"])
-        self.source: str = f"{self.meta['renderer']}, generator {self.meta['generator']}"
-        """Renderer and generator version, for the provenance of a model."""
+        super().__init__(path)
         samples, height, width = self.arrays["color"].shape
         self.hr = self.arrays["color"]  # as of :class:`View`, one sample a pass
         self.lr_spp = np.ones(len(self.arrays["lr_color"]), np.int64)
@@ -219,29 +215,25 @@ class Folder:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self._views: dict[Path, View] = {}
-        self._sample_views: dict[Path, SampleView] = {}
+        self._views: dict[Path, View | SampleView] = {}
         self.scan()
 
     def scan(self) -> None:
         """Pick up new views. Hidden files are still being written. The next scan retries unreadable files."""
         for path in sorted(self.root.glob("[!.]*.npz")):
-            if path not in self._views and path not in self._sample_views:
+            if path not in self._views:
                 try:
-                    if path.name.endswith(SAMPLES_SUFFIX):
-                        self._sample_views[path] = SampleView(path)
-                    else:
-                        self._views[path] = View(path)
+                    self._views[path] = (SampleView if path.name.endswith(SAMPLES_SUFFIX) else View)(path)
                 except (ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile) as error:
                     log.warning("skipped %s: %s", path.name, error)
 
     def split(self, name: str) -> list[View]:
         """Return the views of one split, sorted by file name."""
-        return [view for _, view in sorted(self._views.items()) if view.split == name]
+        return [v for _, v in sorted(self._views.items()) if isinstance(v, View) and v.split == name]
 
     def sample_views(self, split: str) -> list[SampleView]:
         """Return the views of one split that keep single samples, sorted by file name."""
-        return [view for _, view in sorted(self._sample_views.items()) if view.split == split]
+        return [v for _, v in sorted(self._views.items()) if isinstance(v, SampleView) and v.split == split]
 
 
 def split_features(passes: Array) -> dict[str, Array]:
@@ -258,21 +250,17 @@ def as_float32(values: NDArray, *, signed: bool = False) -> Array:
     return repair(values.astype(np.float32), signed=signed)[0]
 
 
-def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int], scale: int, *, nearest: bool = False) -> Array:
+def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int], scale: int) -> Array:
     """Average the LRHS of a whole view, (H // s, W // s, 3).
 
     Args:
         passes: indices of the ``lr`` passes to average, weighted by their spp.
-        nearest: take one pixel of s x s instead of their mean, as the paper does. It has no effect on passes that were
-            rendered at 1/s of the resolution.
     """
     weights = view.lr_spp[passes] / view.lr_spp[passes].sum()
     stored = view.lr[scale if scale in view.lr else 1]
     mean = np.einsum("p,phwc->hwc", weights.astype(np.float32), as_float32(stored[passes]))
     if scale in view.lr:
         return mean
-    if nearest:
-        return mean[scale // 2 :: scale, scale // 2 :: scale]
     height, width = (n // scale * scale for n in mean.shape[:2])
     return box_downsample(mean[:height, :width], scale)
 

@@ -66,7 +66,6 @@ def _network(state: State) -> tuple[str, dict[str, Any]]:
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="checkpoint to write")
     parser.add_argument("checkpoints", type=Path, nargs="+", help="checkpoints to average")

@@ -59,16 +59,10 @@ def save(state: State | list[Any], path: Path) -> None:
 def read(path: Path) -> State:
     """Read a checkpoint; parameters get their present names."""
     state = torch.load(path, map_location="cpu", weights_only=True)
-    for key in ("ema", "network"):
-        if key in state:
-            state[key] = {_present_name(name): value for name, value in state[key].items()}
+    for key in state.keys() & {"ema", "network"}:
+        for old, new in RENAMED.items():
+            state[key] = {name.replace(old, new): value for name, value in state[key].items()}
     return state
-
-
-def _present_name(parameter: str) -> str:
-    for old, new in RENAMED.items():
-        parameter = parameter.replace(old, new)
-    return parameter
 
 
 def finished(state: State) -> State:

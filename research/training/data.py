@@ -149,7 +149,11 @@ class ViewTensors:
         return cls(on_device(view.hr), lr, on_device(view.ref), view.lr_spp)
 
     def lrhs(self, passes: np.ndarray, scale: int, *, nearest: bool) -> Tensor:
-        """Average passes, as :func:`research.datagen.views.mean_lrhs`: (H/s, W/s, 3)."""
+        """Average passes, as :func:`research.datagen.views.mean_lrhs`: (H/s, W/s, 3).
+
+        ``nearest`` takes one pixel of s x s instead of their mean, as the paper does. It has no effect on passes that
+        were rendered at 1/s of the resolution.
+        """
         stored = self.lr[scale if scale in self.lr else 1]
         weights = torch.from_numpy((self.lr_spp[passes] / self.lr_spp[passes].sum()).astype(np.float32))
         images = repair(torch.stack([stored[p] for p in passes]))

@@ -47,7 +47,6 @@ def fit(network: JointFusion, views: Path, scales: list[int], prepare: data.Prep
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("output", type=Path, help="checkpoint to write")

@@ -29,7 +29,6 @@ import onnxruntime
 import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
-from torch import nn
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.model.contract import NO_DENOISER, SCALES, SPREAD, Contract
@@ -43,7 +42,7 @@ from research.training.oidn import provenance
 from research.training.paper import MultiResolutionFusion
 from research.training.quantise import joint
 from research.training.quantise.layers import Networks, quantised, varied
-from research.training.tracing import IR_VERSION, prepend, shuffle, traced, unshuffle
+from research.training.tracing import IR_VERSION, prepend, traced
 from research.training.whole_model import InTorch, example, quantised_denoiser, save, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
@@ -100,24 +99,16 @@ def denoiser_for(network: JointFusion, mode: str) -> MeanDenoiser:
 
 
 @torch.inference_mode()
-def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
-    """Export a network that needs no calibration.
+def to_onnx(network: MultiResolutionFusion, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
+    """Export the paper's network, which needs no calibration.
 
-    Inputs are ``lrhs`` and ``hrls``, encoded; outputs ``fused``, log-encoded, and, except for the paper's network,
-    ``log_error``. The batch size is 1; height and width are any multiples of the contract's alignment.
+    Inputs are ``lrhs`` and ``hrls``, encoded; the output is ``fused``, log-encoded. The batch size is 1; height and
+    width are any multiples of the contract's alignment.
     """
-    scale, alignment = contract.scale, contract.alignment
-    inputs = network_example(network, scale, alignment)
-    aten = torch.ops.aten
-    module: nn.Module
-    translations: dict[Any, Any]
-    if isinstance(network, MultiResolutionFusion):
-        module, outputs = _with_onnx_channel_order(network), ["fused"]
-        translations = {aten.pixel_unshuffle.default: _space_to_depth}
-    else:
-        module, outputs = network, ["fused", "log_error"]
-        translations = {aten.pixel_unshuffle.default: unshuffle, aten.pixel_shuffle.default: shuffle}
-    model = traced(module, inputs, ["lrhs", "hrls"], outputs, alignment, translations)
+    inputs = network_example(network, contract.scale, contract.alignment)
+    module = _with_onnx_channel_order(network)
+    translations = {torch.ops.aten.pixel_unshuffle.default: _space_to_depth}
+    model = traced(module, inputs, ["lrhs", "hrls"], ["fused"], contract.alignment, translations)
     if half:
         _store_as_half(model.graph)
     model.ir_version = IR_VERSION
@@ -140,9 +131,11 @@ def mixing_of(network: JointFusion, contract: Contract) -> onnx.ModelProto:
 
 @torch.inference_mode()
 def joint_to_onnx(network: JointFusion, contracts: Sequence[Contract], pairs: Sequence[Pair]) -> list[onnx.ModelProto]:
-    """Export a joint network with 8-bit convolutions for several scales, as :func:`to_onnx`.
+    """Export a joint network with 8-bit convolutions for several scales.
 
-    The graphs have the same weights. They are calibrated on pairs of the network's inputs, of all these scales.
+    Inputs are those of :func:`to_onnx`; outputs are ``fused``, log-encoded, and ``log_error``; for the size ``large``
+    also ``albedo`` and ``normal``. The graphs have the same weights. They are calibrated on pairs of the network's
+    inputs, of all these scales.
     """
     layers: Networks | None = None
     if network.layers is not None:
@@ -236,25 +229,20 @@ def check_casts(path: Path) -> None:
     counts = collections.Counter(node.op_type for node in onnx.load(optimised).graph.node)
     optimised.unlink()
     if counts["Cast"]:
-        raise SystemExit(
-            f"{path}: {counts['Cast']} casts of weights are left after loading; they would slow every tile"
-        )
+        left = f"{counts['Cast']} casts of weights are left after loading"
+        raise SystemExit(f"{path}: {left}; they would slow every tile")
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--scale", type=int, nargs="+", help="scales to export, of a network for several")
     parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--half", action="store_true", help="store weights as half floats")
-    parser.add_argument(
-        "--int8", type=Path, metavar="VIEWS", help="compute convolutions in 8 bits, calibrated on these views"
-    )
-    parser.add_argument(
-        "--overlap", type=int, nargs="+", default=[24], help="LRHS pixels that tiles share on each side, for each scale"
-    )
+    parser.add_argument("--int8", type=Path, metavar="VIEWS", help="convolutions in 8 bits, calibrated on these views")
+    overlap = "LRHS pixels that tiles share on each side, for each scale"
+    parser.add_argument("--overlap", type=int, nargs="+", default=[24], help=overlap)
     parser.add_argument("--denoiser", type=Path, help="quantised denoiser of both renders' mean (default: the shipped)")
     args = parser.parse_args()
 

@@ -123,7 +123,6 @@ def _store_kernels_in_8_bits(graph: onnx.GraphProto) -> None:
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("models", type=Path, nargs="+", help="the network's files for CPUs, one for each scale")

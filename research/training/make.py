@@ -139,7 +139,6 @@ def _wait(process: subprocess.Popen[bytes]) -> int:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recipe", help="such as joint, joint-small, joint-large, their -spread models, paper, mean-x1")
     parser.add_argument("--work", type=Path, default=Path("retrained"), help="folder for all files (%(default)s)")

@@ -42,26 +42,19 @@ def mean_model(path: Path) -> onnx.ModelProto:
         if needed & set(node.output):
             needed |= set(node.input)
             nodes.insert(0, node)
-    del graph.node[:], graph.output[:]
-    graph.node.extend(nodes)
     tensors = [tensor for tensor in graph.initializer if tensor.name in needed]
-    del graph.initializer[:]
-    graph.initializer.extend(tensors)
     info = helper.make_tensor_value_info
-    graph.output.append(info(FUSED, TensorProto.FLOAT, [1, 3, "h", "w"]))
-    images = [info(name, TensorProto.FLOAT, [1, n, "h", "w"] if n else []) for name, n in contract.inputs.items()]
-    del graph.input[:]
-    graph.input.extend(images)
+    outputs = [info(FUSED, TensorProto.FLOAT, [1, 3, "h", "w"])]
+    inputs = [info(name, TensorProto.FLOAT, [1, n, "h", "w"] if n else []) for name, n in contract.inputs.items()]
     provenance = contract.provenance | {"cut_from": contract.name}
     name = f"{MEAN_MODEL}{SPREAD if contract.denoiser.endswith(SPREAD) else ''}-x1"
     contract = replace(contract, name=name, scale=1, bytes_per_pixel=BYTES_PER_PIXEL, provenance=provenance)
+    graph.CopyFrom(helper.make_graph(nodes, name, inputs, outputs, tensors))
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
-    graph.name = name
     return model
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, help="file for CPUs of a joint model at x2 with a denoiser of its own")
     args = parser.parse_args()

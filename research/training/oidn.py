@@ -7,35 +7,106 @@ No file of this project holds the original weights.
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import itertools
+import mmap
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from research.training.oidn_weights import require_weights
+from oiio_msspl.errors import InputError
 from research.training.ops import upsample
 
-#: Open Image Denoise's names of its networks, see :data:`research.training.oidn_weights.NETWORKS`.
+#: Open Image Denoise's names of its networks for HDR colour with albedo and normal; the large one wants these clean.
 SMALL_HDR, BASE_HDR, LARGE_HDR = "rt_hdr_alb_nrm_small", "rt_hdr_alb_nrm", "rt_hdr_calb_cnrm_large"
-#: The small network for noise-free albedo and normal.
+#: The small one for clean albedo and normal, and those for albedo and for normal alone.
 SMALL_CLEAN_HDR = "rt_hdr_calb_cnrm_small"
 ALBEDO_BASE, NORMAL_BASE = "rt_alb", "rt_nrm"
+
+#: Networks of Open Image Denoise 2.5, with the size in bytes and the SHA-256 of their weights.
+NETWORKS = {
+    BASE_HDR: (1841160, "e586ef2ff48d7fbb7611986405220ed8fc5c13ca79bfc40be4dc742fbf959e1a"),
+    SMALL_HDR: (641480, "980ea307e7825cae23ed8b1addf8de62ece84b61094795a5631ebf1c91b2e1a7"),
+    SMALL_CLEAN_HDR: (641480, "a6c43bfdbff01bdd8a9c777e139720f9e58b872a50c8db07079bddd007482dc5"),
+    LARGE_HDR: (7698439, "08130cdc4f33b7a513d0073757f089ac830f900613bb5bad72ca42c52b934465"),
+    ALBEDO_BASE: (1830792, "752c9a8d57884d660ae375a7c853cad8a44f77d559bb282f0ef39f8e758601a4"),
+    NORMAL_BASE: (1830792, "fb8f7f5571332b602406f88a0b570d809dd3c06aebb530f5d048828f57490bc7"),
+}
+
+_TZA_MAGIC = b"\xd7\x41\x02"
 
 Weights = Mapping[str, Tensor]
 
 
+@functools.cache
+def _installed_weights(network: str) -> dict[str, NDArray[np.float16]]:
+    begins, install = "the joint network begins from the weights of Open Image Denoise", "pip install pyoidn==2.5.1"
+    try:
+        import pyoidn
+    except (ImportError, OSError) as error:
+        raise InputError(f"{begins}: {install}") from error
+    library = next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
+    weights = read_weights(network, library) if library else None
+    if weights is None:
+        raise InputError(f"{begins} 2.5, and the installed pyoidn has others: {install}")
+    return weights
+
+
 def pretrained_weights(network: str) -> dict[str, Tensor]:
-    """Read the weights of one of :data:`research.training.oidn_weights.NETWORKS`, by Open Image Denoise's names.
+    """Read the weights of a key of `NETWORKS` from the installed pyoidn, by Open Image Denoise's names.
 
     Raises:
         InputError: pyoidn is not installed, or has other weights.
     """
-    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in require_weights(network).items()}
+    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in _installed_weights(network).items()}
+
+
+def read_weights(network: str, library: Path) -> dict[str, NDArray[np.float16]] | None:
+    """Find a network's weights in a library file by their digest; None if they are not in it."""
+    size, digest = NETWORKS[network]
+    with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        start = content.find(_TZA_MAGIC)
+        while start >= 0:
+            blob = content[start : start + size]
+            if hashlib.sha256(blob).hexdigest() == digest:
+                return _read_tza(blob)
+            start = content.find(_TZA_MAGIC, start + 1)
+    return None
+
+
+def _read_tza(blob: bytes) -> dict[str, NDArray[np.float16]]:
+    """Read tensors in Open Image Denoise's TZA 2 format.
+
+    A header with the position of a table; the table has a name, a shape, a layout, a type and a position for each
+    tensor.
+    """
+    position = 0
+
+    def take(form: str) -> tuple[Any, ...]:
+        nonlocal position
+        values = struct.unpack_from(f"<{form}", blob, position)
+        position += struct.calcsize(f"<{form}")
+        return values
+
+    *_, position = take("HBBQ")
+    tensors = {}
+    for _ in range(*take("I")):
+        name = take(f"{take('H')[0]}s")[0].decode()
+        dimensions = take("B")[0]
+        shape = take(f"{dimensions}I")
+        take(f"{dimensions + 1}s")  # layout and type: always contiguous half floats
+        (offset,) = take("Q")
+        tensors[name] = np.frombuffer(blob, np.float16, int(np.prod(shape)), offset).reshape(shape)
+    return tensors
 
 
 def provenance(network: str) -> dict[str, str]:
@@ -108,13 +179,8 @@ def run_unet(
 
 def run_unet_on_tensors(shape: Shape, inputs: Sequence[Tensor], conv: Callable[[str, Tensor], Tensor]) -> Tensor:
     """Run a U-Net on images (N, C, H, W)."""
-
-    def concat(above: Tensor, skipped: Tensor) -> Tensor:
-        return torch.cat([above, skipped], dim=1)
-
-    return run_unet(
-        shape, inputs, conv, lambda values: F.max_pool2d(values, 2), lambda values: upsample(values, 2), concat
-    )
+    pool, twice = functools.partial(F.max_pool2d, kernel_size=2), functools.partial(upsample, factor=2)
+    return run_unet(shape, inputs, conv, pool, twice, lambda above, skipped: torch.cat([above, skipped], dim=1))
 
 
 class FineTunedConv(nn.Module):
@@ -167,7 +233,7 @@ class Start:
     """What the fine-tuning of a whole network starts from."""
 
     network: str
-    """A key of :data:`research.training.oidn_weights.NETWORKS`."""
+    """A key of ``NETWORKS``."""
     shape: Shape
     readers: tuple[str, ...]
     """The convolutions that read the input."""

@@ -275,7 +275,6 @@ class PooledBatches:
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, help="folder of training views")
     parser.add_argument("pool", type=Path, help="folder for the pairs")
@@ -283,12 +282,9 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=6, help="pairs per view (%(default)s)")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
-    parser.add_argument(
-        "--denoise", type=Path, nargs=2, default=(), metavar="JOINT", help="pairs for the size large, see above"
-    )
-    parser.add_argument(
-        "--teach", type=Path, nargs=2, default=(), metavar="LARGE", help="targets by a teacher with these, see above"
-    )
+    denoise, teach = "pairs for the size large, see above", "targets by a teacher with these, see above"
+    parser.add_argument("--denoise", type=Path, nargs=2, default=(), metavar="JOINT", help=denoise)
+    parser.add_argument("--teach", type=Path, nargs=2, default=(), metavar="LARGE", help=teach)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     joints, larges = ([checkpoints.load_joint(path)[0] for path in paths] for paths in (args.denoise, args.teach))

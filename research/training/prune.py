@@ -72,7 +72,6 @@ def pruned(network: JointFusion, name: str, count: int, pairs: list[data.Batch])
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("output", type=Path, help="checkpoint to write")

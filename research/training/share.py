@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 
@@ -30,12 +29,8 @@ SMALLEST = 4096
 ALIGNMENT = 64
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a tensor lies: a range of a weights file, or an ONNX file."""
-
-    file: str
-    offset: int = 0
+#: Where a tensor lies: its file, and the offset in it; 0 in an ONNX file.
+Place = tuple[str, int]
 
 
 def share(folder: Path) -> None:
@@ -46,17 +41,17 @@ def share(folder: Path) -> None:
     for path, model in models.items():
         for tensor in model.graph.initializer:
             place, data = _stored(path, tensor)
-            if place.file != path.name or len(data) >= SMALLEST:
+            if place[0] != path.name or len(data) >= SMALLEST:
                 places[data].add(place)
                 tensors.append((tensor, data))
     files: dict[str, bytearray] = defaultdict(bytearray)
     offsets: dict[bytes, tuple[str, int]] = {}
     for tensor, data in tensors:
-        found = places[data]
-        if len(found) == 1 and next(iter(found)).file.endswith(".onnx"):
+        owners = [file for file, _ in places[data]]
+        if len(owners) == 1 and owners[0].endswith(".onnx"):
             continue  # only this model has it
         if data not in offsets:
-            name = _name_of_shared({place.file for place in found})
+            name = _name_of_shared(set(owners))
             content = files[name]
             content += bytes(-len(content) % ALIGNMENT)
             offsets[data] = name, len(content)
@@ -76,11 +71,11 @@ def share(folder: Path) -> None:
 def _stored(path: Path, tensor: onnx.TensorProto) -> tuple[Place, bytes]:
     """Return where a tensor of a model lies, and its bytes."""
     if tensor.data_location != onnx.TensorProto.EXTERNAL:
-        return Place(path.name), tensor.raw_data
+        return (path.name, 0), tensor.raw_data
     info = ExternalDataInfo(tensor)
     with (path.parent / info.location).open("rb") as file:
         file.seek(info.offset or 0)
-        return Place(info.location, info.offset or 0), file.read(info.length)
+        return (info.location, info.offset or 0), file.read(info.length)
 
 
 def _name_of_shared(owners: set[str]) -> str:
@@ -93,7 +88,6 @@ def _name_of_shared(owners: set[str]) -> str:
 
 
 def main() -> None:
-    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     args = parser.parse_args()

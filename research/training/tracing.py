@@ -5,11 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import onnx
 import torch
-from onnx import numpy_helper
-from onnxscript import opset18
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -49,27 +46,6 @@ def prepend(graph: onnx.GraphProto, nodes: list[onnx.NodeProto]) -> None:
     nodes = [*nodes, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)
-
-
-def unshuffle(x: Any, downscale_factor: int) -> Any:
-    """Unshuffle pixels by a grouped convolution with kernels of a single tap, in PyTorch's channel order.
-
-    It runs on all cores. The exporter's own translation has a Transpose, which takes four times as long.
-    """
-    weight = _taps(x.shape[1], downscale_factor)
-    return opset18.Conv(x, weight, group=x.shape[1], strides=[downscale_factor] * 2)
-
-
-def shuffle(x: Any, upscale_factor: int) -> Any:
-    """Shuffle pixels by a grouped transposed convolution, likewise."""
-    planes = x.shape[1] // upscale_factor**2
-    return opset18.ConvTranspose(x, _taps(planes, upscale_factor), group=planes, strides=[upscale_factor] * 2)
-
-
-def _taps(planes: int, size: int) -> Any:
-    """Return kernels (planes * size**2, 1, size, size), each with a single tap."""
-    taps = np.tile(np.eye(size**2, dtype=np.float32), (planes, 1)).reshape(-1, 1, size, size)
-    return opset18.Constant(value=numpy_helper.from_array(taps))
 
 
 def _strip_traces(model: onnx.ModelProto) -> None:

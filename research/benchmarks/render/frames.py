@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from oiio_msspl.model.contract import SCALES
 from research.benchmarks.render.film import frame_size, set_crop, write_exr
 from research.benchmarks.render.sequences import CHANNELS, MAX_DEPTH
-from research.datagen.mitsuba.start import start as start_mitsuba
+from research.datagen.mitsuba import start as start_mitsuba
 
 #: Longer side of a frame in pixels.
 LONGER = 640

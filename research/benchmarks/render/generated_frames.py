@@ -16,6 +16,7 @@ import gc
 import itertools
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,10 @@ import numpy as np
 from oiio_msspl.image.arrays import Array
 from research.benchmarks.render.film import write_exr
 from research.benchmarks.render.sequences import CHANNELS
-from research.datagen.mitsuba.start import start as start_mitsuba
+from research.datagen.mitsuba import start as start_mitsuba
 
+#: The first seed.
+FIRST = 9000
 #: Folder's suffix -> width and height of the frame.
 SIZES = {"": (640, 400), "-right": (645, 397)}
 HRLS = (1, 8)
@@ -34,16 +37,6 @@ LRHS = ((2, 1), (4, 1), (4, 4), (8, 1))
 LAUNCH = 1_000_000
 #: Standard deviation and radius of the Gaussian filter in pixels: Mitsuba's default.
 DEVIATION, RADIUS = 0.5, 2.0
-
-
-class WideCamera:
-    """A camera of `research.datagen.mitsuba.trace`, which is square, for frames that are wider than high."""
-
-    def __init__(self, camera: Any, size: tuple[int, int]) -> None:
-        self.camera, self.aspect = camera, size[1] / size[0]
-
-    def rays(self, x: Any, y: Any, lens: Any) -> Any:
-        return self.camera.rays(x, (y - 0.5) * self.aspect + 0.5, lens)
 
 
 def splat(values: Array, place: Array) -> tuple[Array, Array]:
@@ -73,6 +66,8 @@ def render(scene: Any, camera: Any, folder: Path, size: tuple[int, int], gaussia
     """Render the files of one camera that do not exist yet."""
     from research.datagen.mitsuba.trace import render_samples
 
+    aspect = size[1] / size[0]  # the camera's own picture is square
+    wide: Any = SimpleNamespace(rays=lambda x, y, lens: camera.rays(x, (y - 0.5) * aspect + 0.5, lens))
     jobs = [(f"hr_{spp}spp", 1, spp) for spp in HRLS]
     jobs += [(f"lr_x{scale}_{scale**2 * n}spp", scale, scale**2 * n) for scale, n in LRHS]
     for name, scale, spp in jobs:
@@ -85,7 +80,7 @@ def render(scene: Any, camera: Any, folder: Path, size: tuple[int, int], gaussia
         for done in range(0, spp, per_launch):
             count = min(per_launch, spp - done)
             seed = zlib.crc32(f"{folder.name} {name} {done}".encode())
-            samples = render_samples(scene, WideCamera(camera, size), (width, height), count, seed)  # type: ignore[arg-type]
+            samples = render_samples(scene, wide, (width, height), count, seed)
             values = np.concatenate([samples[layer] for layer in ("color", "albedo", "normal")], axis=-1)
             sums = splat(values, samples["place"]) if gaussian else (values.sum(axis=0), np.float32(count))
             total, weights = total + sums[0], weights + sums[1]
@@ -96,7 +91,6 @@ def render(scene: Any, camera: Any, folder: Path, size: tuple[int, int], gaussia
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--first", type=int, default=9000, metavar="SEED")
     parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--assets", type=Path, required=True, help="folder of HDRIs and models")
     parser.add_argument("--threads", type=int, default=1)
@@ -108,7 +102,7 @@ def main() -> None:
     from research.datagen.mitsuba.render import find_cameras
 
     assets = Assets(args.assets)
-    for seed in range(args.first, args.first + args.scenes):
+    for seed in range(FIRST, FIRST + args.scenes):
         scene, plan = scenes.build(seed, assets)
         print(f"{plan.kind}-{seed}", flush=True)
         for view, (suffix, size) in enumerate(SIZES.items()):

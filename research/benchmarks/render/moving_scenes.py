@@ -20,6 +20,9 @@ ROOM = (6.0, 5.0, 3.0)
 CAMERA, TARGET = np.array([0.3, -2.2, 1.5]), np.array([0.1, 2.4, 0.9])
 #: Where the block in the middle stands: the object that slides or turns.
 BLOCK = np.array([0.1, 0.6, 0.0])
+#: The camera's axis, and how far away along it the middle of the block is.
+FORWARD = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
+FOCUS = float((BLOCK + np.array([0, 0, 0.3]) - CAMERA) @ FORWARD)
 #: Horizontal angle of view, degrees.
 ANGLE = 62.0
 #: The frame at which the second lamp of "lamp_on" is on.
@@ -78,19 +81,12 @@ class Room:
 
 def camera_matrix(animation: Animation, at: float) -> np.ndarray:
     """Return the matrix from camera (x to the left) to world, (4, 4). ``at``: frames from the middle."""
-    forward = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
-    left = np.cross([0, 0, 1], forward)
+    left = np.cross([0, 0, 1], FORWARD)
     left /= np.linalg.norm(left)
     matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([left, np.cross(forward, left), forward], axis=1)
-    matrix[:3, 3] = CAMERA + at * (animation.dolly * forward - animation.truck * left)
+    matrix[:3, :3] = np.stack([left, np.cross(FORWARD, left), FORWARD], axis=1)
+    matrix[:3, 3] = CAMERA + at * (animation.dolly * FORWARD - animation.truck * left)
     return matrix
-
-
-def focus_distance() -> float:
-    """Return the metres from the camera to the block in the middle, along the camera's axis."""
-    forward = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
-    return float((BLOCK + np.array([0, 0, 0.3]) - CAMERA) @ forward)
 
 
 def object_matrix(animation: Animation, at: float) -> np.ndarray:

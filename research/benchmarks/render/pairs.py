@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.model.contract import SCALES
 from research.benchmarks.render.film import CROP, frame_size, set_crop, write_exr
-from research.datagen.mitsuba.start import start as start_mitsuba
+from research.datagen.mitsuba import start as start_mitsuba
 from research.datagen.views import FILTERS
 
 HRLS = (1, 2, 3, 4, 6, 7, 8)

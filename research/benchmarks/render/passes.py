@@ -22,7 +22,7 @@ import numpy as np
 from oiio_msspl.model.contract import SCALES
 from research.benchmarks.render.film import write_exr
 from research.benchmarks.render.pairs import SensorCamera, mean_of_samples
-from research.datagen.mitsuba.start import start as start_mitsuba
+from research.datagen.mitsuba import start as start_mitsuba
 
 SPP = (1, 2, 4)
 #: Most light groups of a scene; lamps that follow each other in the scene share one.

@@ -32,17 +32,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from research.benchmarks.render import moving_scenes as rooms
 from research.benchmarks.render.film import set_crop, write_exr
-from research.benchmarks.render.moving_scenes import (
-    ANGLE,
-    ANIMATIONS,
-    Room,
-    build_room,
-    camera_matrix,
-    focus_distance,
-    object_matrix,
-)
-from research.datagen.mitsuba.start import start as start_mitsuba
+from research.benchmarks.render.moving_scenes import ANIMATIONS, Room
+from research.datagen.mitsuba import start as start_mitsuba
 
 SCALES = (2, 4)
 #: The sequence in which nothing moves: one reference is enough.
@@ -143,16 +136,18 @@ class _AnimatedRoom:
         self._animation = ANIMATIONS[name]
 
     def camera(self, at: float) -> Camera:
-        focal = WIDTH / 2 / np.tan(np.radians(ANGLE) / 2)
+        focal = WIDTH / 2 / np.tan(np.radians(rooms.ANGLE) / 2)
         centre, aperture = (WIDTH / 2, HEIGHT / 2), self._animation.aperture
-        return Camera(camera_matrix(self._animation, at), focal, centre, aperture, focus_distance())
+        return Camera(rooms.camera_matrix(self._animation, at), focal, centre, aperture, rooms.FOCUS)
 
     def room(self, frame: int, at: float) -> Room:
-        return build_room(self._animation, frame, at)
+        return rooms.build_room(self._animation, frame, at)
 
     def object_moves(self, at: float, other: float) -> NDArray[Any]:
         """Return the matrix from the moving object's place at one time to that at another, (4, 4)."""
-        return np.asarray(object_matrix(self._animation, other) @ np.linalg.inv(object_matrix(self._animation, at)))
+        return np.asarray(
+            rooms.object_matrix(self._animation, other) @ np.linalg.inv(rooms.object_matrix(self._animation, at))
+        )
 
 
 def surfaces(mi: Any, room: Room, camera: Camera) -> NDArray[Any]:

@@ -56,7 +56,6 @@ def main() -> None:
     parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
     parser.add_argument("--without-vectors", action="store_true", help="leave out the motion vectors of Mitsuba's")
     parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
-    parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
     parser.add_argument("--methods", default="*", metavar="PATTERN", help="measure only these")
     args = parser.parse_args()
     files = args.folder.glob("*/*/hr.0001.exr")
@@ -65,7 +64,7 @@ def main() -> None:
         parser.error(f"{args.folder}: holds no sequences; python -m research.benchmarks.render.sequences makes them")
     for name in names:
         sequence = load(args.folder / name, args.motion_format)
-        options = TemporalOptions(args.temporal, args.motion_format)
+        options = TemporalOptions(AUTO, args.motion_format)
         with tempfile.TemporaryDirectory() as folder:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
             made = list(all_methods(judged, options, args.methods, spread=args.spread))

@@ -7,6 +7,7 @@ light groups.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -56,11 +57,16 @@ def write_shot(folder: Path, count: int, width: int, height: int, scale: int, la
                 back = np.full((height, width, 2), (STEP, 0), np.float32)
                 layers |= {"depth": (np.full((height, width, 1), 5, np.float32), "Z")}
                 layers |= {"motionBack": (back, "XY"), "motionFore": (-back, "XY")}
-            channels = {
-                f"{layer}.{letter}".lstrip("."): np.ascontiguousarray(image[..., i], np.float16)
-                for layer, (image, letters) in layers.items()
-                for i, letter in enumerate(letters)
-            }
-            header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-            with OpenEXR.File(header, channels) as file:
-                file.write(str(folder / name / f"{name}.{number:04d}.exr"))
+            write_layers(folder / name / f"{name}.{number:04d}.exr", layers)
+
+
+def write_layers(path: Path, layers: Mapping[str, tuple[Array, str]]) -> None:
+    """Write layers (h, w, c), each with a letter for every channel, as half floats."""
+    channels = {
+        f"{layer}.{letter}".lstrip("."): np.ascontiguousarray(image[..., i], np.float16)
+        for layer, (image, letters) in layers.items()
+        for i, letter in enumerate(letters)
+    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))

@@ -26,7 +26,7 @@ from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.shots.moving_wall import STEP, clean_frame, write_shot
 
-SIZE, LAMPS = (320, 180), 4
+SIZE, LAMPS, FRAMES = (320, 180), 4, 18
 #: Frames at either end of the shot have fewer neighbours and are not scored.
 ENDS = 6
 
@@ -46,7 +46,7 @@ def scores(errors: Array) -> tuple[float, float]:
     return float(-10 * np.log10(np.mean(errors**2))), float(np.abs(moved).mean())
 
 
-def measure(folder: Path, count: int, scale: int, quality: str, frames: str) -> list[Row]:
+def measure(folder: Path, scale: int, quality: str, frames: str) -> list[Row]:
     """Return a row for the beauty, and one for the mean of all passes."""
     out = folder / f"{quality} {frames}"
     out.mkdir()
@@ -54,8 +54,8 @@ def measure(folder: Path, count: int, scale: int, quality: str, frames: str) -> 
     if report.exit_code:
         raise SystemExit(next(result.message for result in report.results.values() if result.message))
     errors = []
-    for number in range(1 + ENDS, count + 1 - ENDS):
-        _, lights = clean_frame(number, count, *SIZE, LAMPS)
+    for number in range(1 + ENDS, FRAMES + 1 - ENDS):
+        _, lights = clean_frame(number, FRAMES, *SIZE, LAMPS)
         fused = images_of(out / f"hr.{number:04d}.exr")
         errors.append([image - clean for image, clean in zip(fused, [sum(lights), *lights], strict=True)])
     beauty, *passes = (scores(images) for images in np.swapaxes(np.array(errors), 0, 1))
@@ -66,15 +66,13 @@ def measure(folder: Path, count: int, scale: int, quality: str, frames: str) -> 
 
 def main() -> None:
     """Measure both qualities at both scales, frame by frame and with neighbours."""
-    parser = results.parser(__doc__)
-    parser.add_argument("--frames", type=int, default=18)
-    args = parser.parse_args()
+    args = results.parser(__doc__).parse_args()
     rows: list[Row] = []
     for scale in (2, 4):
         with tempfile.TemporaryDirectory() as folder:
-            write_shot(Path(folder), args.frames, *SIZE, scale, LAMPS)
+            write_shot(Path(folder), FRAMES, *SIZE, scale, LAMPS)
             for quality, frames in itertools.product(("balanced", "best"), ("off", "auto")):
-                rows += measure(Path(folder), args.frames, scale, quality, frames)
+                rows += measure(Path(folder), scale, quality, frames)
     results.show(rows, args.table)
 
 

@@ -41,11 +41,6 @@ def enlarged(pair: Pair) -> Array:
     return upsample_bicubic(repair(pair.lr.layers[RGB])[0], pair.hr.data_window.width, pair.hr.data_window.height)
 
 
-def oidn_prefiltered(pair: Pair) -> tuple[Array, list[str]]:
-    """Denoise the HRLS with denoised albedo and normal."""
-    return peers.oidn_prefiltered(pair.hr), []
-
-
 def ours(session: Session) -> Method:
     """Return the method that fuses with a model."""
 
@@ -54,12 +49,6 @@ def ours(session: Session) -> Method:
         return fused.rgb, [*fused.warnings]
 
     return run
-
-
-def methods_for(scale: int, sessions: list[Session]) -> dict[str, Method]:
-    """Return the methods of a scale by name."""
-    models = {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
-    return models | {"OIDN prefiltered on the HRLS": oidn_prefiltered}
 
 
 def run(scale: int, methods: dict[str, Method], size: int) -> list[dict[str, Any]]:
@@ -81,7 +70,6 @@ def run(scale: int, methods: dict[str, Method], size: int) -> list[dict[str, Any
 
 
 def main() -> None:
-    """Measure the models of some scales."""
     parser = results.parser(__doc__)
     parser.add_argument("--model", action="append", default=[], help="ONNX file or shipped name; repeat it for more")
     parser.add_argument("--scale", type=int, nargs="+", choices=SCALES, default=[2, 4], help="default: 2 4")
@@ -89,7 +77,11 @@ def main() -> None:
     args = parser.parse_args()
     files = [find_model(4, name) for name in args.model] or list(shipped_models().values())
     sessions = [Session(file) for file in files]
-    rows = [row for scale in args.scale for row in run(scale, methods_for(scale, sessions), args.size)]
+    peer: dict[str, Method] = {"OIDN prefiltered on the HRLS": lambda pair: (peers.oidn_prefiltered(pair.hr), [])}
+    rows = []
+    for scale in args.scale:
+        models = {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
+        rows += run(scale, models | peer, args.size)
     results.show(judged(rows), args.table, KEYS)
 
 

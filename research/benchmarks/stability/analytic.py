@@ -208,20 +208,21 @@ def room(size: int, *, ball: tuple[float, float] = (0.35, 0.52), light: float = 
     visible = where(on_ball, 0.05 + 0.9 * facing, visible)
     highlight = np.exp(-(np.square(dx - 0.3) + np.square(dy + 0.5)) / 0.02)
     gloss = where(on_ball, 3.0 * highlight, gloss)
-    return Scene(
-        surface(x.shape[:2], albedo=albedo, normal=normal, direct=light, visible=visible, ambient=0.12, gloss=gloss)
-    )
+    shown = {"albedo": albedo, "normal": normal, "visible": visible, "gloss": gloss}
+    return Scene(surface(x.shape[:2], **shown, direct=light, ambient=0.12))
+
+
+def changed(scene: Scene, **features: NDArray | float) -> Scene:
+    """Return the back of a scene with other features."""
+    return Scene(surface(scene.back.shape[:2], **(split(scene.back) | features)))
 
 
 def with_emission(scene: Scene, emission: NDArray, dim: float = 1.0) -> Scene:
     """Put emitters in front of a scene whose own light is dimmed. They have no albedo, as in renderers."""
     features = split(scene.back)
     lit = emission.max(axis=-1, keepdims=True) > 0
-    features["emission"] = where(lit, emission, 0)
-    for name in ("direct", "ambient", "gloss"):
-        features[name] = where(lit, 0, features[name] * dim)
-    features["albedo"] = where(lit, 0, features["albedo"])
-    return Scene(surface(scene.back.shape[:2], **features))
+    dimmed = {name: where(lit, 0, features[name] * dim) for name in ("direct", "ambient", "gloss")}
+    return changed(scene, emission=where(lit, emission, 0), albedo=where(lit, 0, features["albedo"]), **dimmed)
 
 
 def small_lights(size: int, radiance: float) -> Scene:
@@ -252,13 +253,9 @@ def near_black(size: int, traces: float = 0.0) -> Scene:
 
     ``traces`` is the share of the glossy light that stays; its tails reach down to the smallest floats.
     """
-    features = split(room(size).back)
-    features |= {
-        "visible": features["visible"] * 0.005,
-        "ambient": np.zeros(1, np.float32),
-        "gloss": features["gloss"] * traces,
-    }
-    return Scene(surface(features["albedo"].shape[:2], **features))
+    lit = room(size)
+    features = split(lit.back)
+    return changed(lit, visible=features["visible"] * 0.005, ambient=0.0, gloss=features["gloss"] * traces)
 
 
 def door_ajar(size: int, seen: float) -> Scene:
@@ -266,14 +263,12 @@ def door_ajar(size: int, seen: float) -> Scene:
 
     A share ``seen`` of the samples finds the light, which gets weaker to the left. Nothing else is lit.
     """
-    x, y = grid(size)
-    features = split(room(size).back)
-    wall = y < 0.66
-    on_ball = np.hypot(x - 0.35, y - 0.52) < 0.15
-    features["albedo"] = where(wall & ~on_ball, 0.8, np.maximum(features["albedo"], 0.2))
+    (x, y), lit = grid(size), room(size)
+    features = split(lit.back)
+    wall = (y < 0.66) & ~(np.hypot(x - 0.35, y - 0.52) < 0.15)
+    albedo = where(wall, 0.8, np.maximum(features["albedo"], 0.2))
     light = np.square(0.2 + x) * (0.4 + 0.6 * features["visible"])
-    dark = {"ambient": np.float32(0), "gloss": np.float32(0)}
-    return Scene(surface(x.shape[:2], **{**features, **dark, "direct": light / seen, "visible": np.float32(seen)}))
+    return changed(lit, albedo=albedo, direct=light / seen, visible=seen, ambient=0.0, gloss=0.0)
 
 
 def slit(size: int, radiance: float) -> Scene:
@@ -290,9 +285,9 @@ def slit(size: int, radiance: float) -> Scene:
 
 def dark_room(size: int) -> Scene:
     """Return a room in which one sample of 10 finds the light, with a trace of ambient light."""
-    features = split(room(size).back)
-    features |= {"visible": 0.1 * features["visible"], "ambient": 0.01 * features["ambient"]}
-    return Scene(surface(features["albedo"].shape[:2], **features))
+    lit = room(size)
+    features = split(lit.back)
+    return changed(lit, visible=0.1 * features["visible"], ambient=0.01 * features["ambient"])
 
 
 def defocused(size: int) -> Scene:
@@ -324,15 +319,8 @@ def moving(size: int) -> Scene:
     streak = time_over(0.3, 0.3 + 3 / size) * (np.abs(y - 0.75) * size < 1.5)
     albedo = where(np.mod(y * 40, 1) < 0.5, (0.8, 0.7, 0.2), (0.1, 0.2, 0.5))
     shining = streak > 0
-    front = surface(
-        x.shape[:2],
-        albedo=where(shining, 0, albedo),
-        normal=(-0.6, 0.0, 0.8),
-        direct=1.2,
-        visible=0.7,
-        ambient=0.1,
-        emission=where(shining, (60.0, 50.0, 30.0), 0),
-    )
+    own = {"albedo": where(shining, 0, albedo), "emission": where(shining, (60.0, 50.0, 30.0), 0)}
+    front = surface(x.shape[:2], **own, normal=(-0.6, 0.0, 0.8), direct=1.2, visible=0.7, ambient=0.1)
     return Scene(room(size).back, front, np.maximum(bar, streak).astype(np.float32))
 
 
@@ -349,25 +337,19 @@ def hairy(size: int) -> Scene:
         distance = np.abs(x - start - bend * np.sin(4 * y + phase)) * size / np.sqrt(1 + slope * slope)
         overlap = np.minimum(distance + cell / 2, pixels / 2) - np.maximum(distance - cell / 2, -pixels / 2)
         coverage = np.maximum(coverage, np.clip(overlap / cell, 0, 1) * (y > 0.1))
-    front = surface(
-        x.shape[:2], albedo=(0.6, 0.42, 0.2), normal=(0.7, 0.0, 0.7), direct=1.5, visible=0.7, ambient=0.1, gloss=0.3
-    )
+    light = {"direct": 1.5, "visible": 0.7, "ambient": 0.1, "gloss": 0.3}
+    front = surface(x.shape[:2], albedo=(0.6, 0.42, 0.2), normal=(0.7, 0.0, 0.7), **light)
     return Scene(room(size, light=0.5).back, front, coverage.astype(np.float32))
 
 
 def glassy(size: int) -> Scene:
     """Return a pane and a lens of albedo 1. Only the specular layer shows what is behind them."""
-    x, y = grid(size)
-    features = split(room(size).back)
+    (x, y), behind = grid(size), room(size)
+    features = split(behind.back)
     pane = (np.abs(x - 0.68) < 0.22) & (np.abs(y - 0.5) < 0.35)
     lens = np.hypot(x - 0.25, y - 0.4) < 0.18
     stripes = np.mod((x + 0.4 * y) * 30, 1) < 0.4
     rings = np.mod(np.hypot(x - 0.25, y - 0.4) * 60, 1) < 0.5
     seen = where(pane, where(stripes, (0.9, 0.7, 0.3), (0.08, 0.1, 0.2)), where(rings, 0.6, (0.1, 0.3, 0.15)))
-    glass = pane | lens
-    features["albedo"] = where(glass, 1, features["albedo"])
-    features["normal"] = where(glass, (0.0, 0.1, 0.99), features["normal"])
-    features["gloss"] = where(glass, seen, features["gloss"])
-    for name in ("direct", "ambient"):
-        features[name] = where(glass, 0, features[name])
-    return Scene(surface(x.shape[:2], **features))
+    shown = {"albedo": 1, "normal": (0.0, 0.1, 0.99), "gloss": seen, "direct": 0, "ambient": 0}
+    return changed(behind, **{name: where(pane | lens, value, features[name]) for name, value in shown.items()})

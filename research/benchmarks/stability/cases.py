@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
@@ -90,14 +90,20 @@ def changed(render: Render, **layers: Array | None) -> Render:
     return Render.from_arrays(render.name, **{k: v for k, v in {**render.layers, **layers}.items() if v is not None})
 
 
+def with_layers(pair: Pair, **layers: Array | None) -> Pair:
+    """Return a pair whose HRLS has other layers; None removes one."""
+    return replace(pair, hr=changed(pair.hr, **layers))
+
+
 def scaled(pair: Pair, factor: float) -> Pair:
     """Return a pair with all light multiplied by a factor."""
     powers = dict.fromkeys((RGB, DIFFUSE, SPECULAR), 1) | {VARIANCE: 2}
-    lr, hr = (
-        changed(r, **{k: v * np.float32(factor ** powers[k]) for k, v in r.layers.items() if k in powers})
-        for r in (pair.lr, pair.hr)
-    )
-    return Pair(lr, hr, pair.reference * np.float32(factor))
+    factors = {name: np.float32(factor**power) for name, power in powers.items()}
+
+    def bright(render: Render) -> Render:
+        return changed(render, **{k: v * factors[k] for k, v in render.layers.items() if k in factors})
+
+    return Pair(bright(pair.lr), bright(pair.hr), pair.reference * np.float32(factor))
 
 
 def with_pixels(render: Render, value: float, share: float, layers: tuple[str, ...] = (RGB,)) -> Render:
@@ -121,8 +127,8 @@ def fireflies(size: int, scale: int) -> Iterator[Case]:
         lobes = (RGB, SPECULAR)
         hr, lr = with_pixels(clean.hr, hot, 1e-3, lobes), with_pixels(clean.lr, hot, 1e-3)
         times = f"{value:.0e}".replace("e+0", "e")
-        yield Case(f"0.1 % of the HRLS, {times} times the mean", Pair(clean.lr, hr, clean.reference), clean)
-        yield Case(f"0.1 % of the LRHS, {times} times the mean", Pair(lr, clean.hr, clean.reference), clean)
+        yield Case(f"0.1 % of the HRLS, {times} times the mean", replace(clean, hr=hr), clean)
+        yield Case(f"0.1 % of the LRHS, {times} times the mean", replace(clean, lr=lr), clean)
 
 
 def broken_values(size: int, scale: int) -> Iterator[Case]:
@@ -130,15 +136,14 @@ def broken_values(size: int, scale: int) -> Iterator[Case]:
     every = (RGB, *OPTIONAL_FEATURES)
     for name, value in (("NaN", np.nan), ("Inf", np.inf), ("-Inf", -np.inf), ("-1", -1.0)):
         hr = with_pixels(clean.hr, value, 1e-3, every)
-        yield Case(f"{name} in 0.1 % of the HRLS, all layers", Pair(clean.lr, hr, clean.reference), clean)
+        yield Case(f"{name} in 0.1 % of the HRLS, all layers", replace(clean, hr=hr), clean)
     for name, value in (("NaN", np.nan), ("Inf", np.inf)):
-        lr = with_pixels(clean.lr, value, 1e-3)
-        yield Case(f"{name} in 0.1 % of the LRHS", Pair(lr, clean.hr, clean.reference), clean)
+        yield Case(f"{name} in 0.1 % of the LRHS", replace(clean, lr=with_pixels(clean.lr, value, 1e-3)), clean)
     holed = {k: v.copy() for k, v in clean.hr.layers.items()}
     height = clean.hr.data_window.height
     for values in holed.values():
         values[height // 4 : height // 4 + height // 8, height // 2 : height // 2 + height // 8] = np.nan
-    yield Case("a bucket of the HRLS all NaN", Pair(clean.lr, changed(clean.hr, **holed), clean.reference), clean)
+    yield Case("a bucket of the HRLS all NaN", with_layers(clean, **holed), clean)
 
 
 def exposure(size: int, scale: int) -> Iterator[Case]:
@@ -158,24 +163,17 @@ def hot_pixel(size: int, scale: int) -> Iterator[Case]:
         return changed(render, rgb=rgb)
 
     middle = clean.hr.data_window.width // 2
-    yield Case(
-        "in the HRLS, moved by one pixel",
-        Pair(clean.lr, at(clean.hr, middle + 1), clean.reference),
-        Pair(clean.lr, at(clean.hr, middle), clean.reference),
-    )
-    yield Case(
-        "in the LRHS, moved by one pixel",
-        Pair(at(clean.lr, middle // scale + 1), clean.hr, clean.reference),
-        Pair(at(clean.lr, middle // scale), clean.hr, clean.reference),
-    )
+    right, left = (replace(clean, hr=at(clean.hr, middle + step)) for step in (1, 0))
+    yield Case("in the HRLS, moved by one pixel", right, left)
+    right, left = (replace(clean, lr=at(clean.lr, middle // scale + step)) for step in (1, 0))
+    yield Case("in the LRHS, moved by one pixel", right, left)
 
 
 def layers(size: int, scale: int) -> Iterator[Case]:
     clean = room(size).pair(scale, 4)  # 4 spp: with 1 there is no variance to remove
     for name in OPTIONAL_FEATURES:
-        yield Case(f"no {name}", Pair(clean.lr, changed(clean.hr, **{name: None}), clean.reference), clean)
-    bare = changed(clean.hr, **dict.fromkeys(OPTIONAL_FEATURES))
-    yield Case("none at all", Pair(clean.lr, bare, clean.reference), clean)
+        yield Case(f"no {name}", with_layers(clean, **{name: None}), clean)
+    yield Case("none at all", with_layers(clean, **dict.fromkeys(OPTIONAL_FEATURES)), clean)
 
 
 def garbage(size: int, scale: int) -> Iterator[Case]:
@@ -194,7 +192,7 @@ def garbage(size: int, scale: int) -> Iterator[Case]:
         "diffuse and specular of noise": {DIFFUSE: noise, SPECULAR: noise[::-1]},
         "every layer of noise": {k: rng.random(have[k].shape, dtype=np.float32) for k in OPTIONAL_FEATURES},
     }.items():
-        yield Case(name, Pair(clean.lr, changed(clean.hr, **layers), clean.reference), clean)
+        yield Case(name, with_layers(clean, **layers), clean)
 
 
 def variance(size: int, scale: int) -> Iterator[Case]:
@@ -207,7 +205,7 @@ def variance(size: int, scale: int) -> Iterator[Case]:
         "10000 times too small": true * 1e-4,
         "of another frame": np.ascontiguousarray(true[::-1, ::-1]),
     }.items():
-        yield Case(name, Pair(clean.lr, changed(clean.hr, variance=values), clean.reference), clean)
+        yield Case(name, with_layers(clean, variance=values), clean)
 
 
 def unusual_spp(size: int, scale: int) -> Iterator[Case]:
@@ -231,27 +229,25 @@ def overflow(size: int, scale: int) -> Iterator[Case]:
     """Yield light beyond 65504, the largest half float."""
     clean = room(size).pair(scale)
     bright = scaled(clean, 4 * MAX_RADIANCE / float(np.quantile(clean.reference, 0.999)))
+
+    def stored(render: Render) -> Render:
+        return changed(render, **{k: v.astype(np.float16).astype(np.float32) for k, v in render.layers.items()})
+
+    # The largest value that such a file can hold
+    bright = replace(bright, reference=np.minimum(bright.reference, MAX_RADIANCE))
     with np.errstate(over="ignore"):
-        lr, hr = (
-            changed(r, **{k: v.astype(np.float16).astype(np.float32) for k, v in r.layers.items()})
-            for r in (bright.lr, bright.hr)
-        )
-    truth = np.minimum(bright.reference, MAX_RADIANCE)  # the largest value that such a file can hold
-    yield Case("a frame that reaches 4 times the largest half", Pair(lr, hr, truth), Pair(bright.lr, bright.hr, truth))
+        held = replace(bright, lr=stored(bright.lr), hr=stored(bright.hr))
+    yield Case("a frame that reaches 4 times the largest half", held, bright)
 
 
-def lights(size: int, scale: int) -> Iterator[Case]:
-    for radiance in (1e2, 1e4, 1e6):
-        made = Base(f"lights {radiance}", analytic.small_lights(size, radiance))
-        yield Case(f"small lights up to {radiance:.0e}".replace("e+0", "e"), made.pair(scale))
-    yield Case("visible emitters, one behind a grille", Base("emitters", analytic.emitters(size)).pair(scale))
+def hard(*scenes: tuple[str, str, Callable[[int], analytic.Scene]]) -> Callable[[int, int], Iterator[Case]]:
+    """Return the cases of scenes that are hard as they are: a name, a name that the noise follows from, the scene."""
 
+    def cases(size: int, scale: int) -> Iterator[Case]:
+        for name, base, scene in scenes:
+            yield Case(name, Base(base, scene(size)).pair(scale))
 
-def dark(size: int, scale: int) -> Iterator[Case]:
-    name = "1 sample of 200 finds the light"
-    yield Case(name, Base("near black", analytic.near_black(size)).pair(scale))
-    traces = Base("near black", analytic.near_black(size, 1e-3))
-    yield Case(f"{name}, traces of 1e-3 to 1e-40 elsewhere", traces.pair(scale))
+    return cases
 
 
 def rare_light(size: int, scale: int) -> Iterator[Case]:
@@ -263,16 +259,6 @@ def rare_light(size: int, scale: int) -> Iterator[Case]:
     dim = Base("dark room", analytic.dark_room(size))
     yield Case("a dark room at 1 spp", dim.pair(scale))
     yield Case("a dark room, 1 spp in both", dim.pair(scale, 1, 1))
-
-
-def blur(size: int, scale: int) -> Iterator[Case]:
-    yield Case("depth of field", Base("depth of field", analytic.defocused(size)).pair(scale))
-    yield Case("motion blur", Base("motion blur", analytic.moving(size)).pair(scale))
-
-
-def detail(size: int, scale: int) -> Iterator[Case]:
-    yield Case("hairs of 0.1 to 0.8 pixels", Base("hairs", analytic.hairy(size)).pair(scale))
-    yield Case("glass that no layer sees through", Base("glass", analytic.glassy(size)).pair(scale))
 
 
 def filters(size: int, scale: int) -> Iterator[Case]:
@@ -296,13 +282,14 @@ def disagreement(size: int, scale: int) -> Iterator[Case]:
     yield Case("another frame: the ball 6 % further", base.pair(scale, lr_scene=ball), clean)
     for factor in (0.25, 0.67, 1.5, 4.0):
         lr = changed(clean.lr, rgb=clean.lr.layers[RGB] * np.float32(factor))
-        yield Case(f"LRHS {factor:g} times as bright", Pair(lr, clean.hr, clean.reference), clean)
+        yield Case(f"LRHS {factor:g} times as bright", replace(clean, lr=lr), clean)
     for pixels in sorted({1, 2, 3, scale, 2 * scale, 3 * scale}):
         moved = analytic.moved(base.scene, pixels, pixels)
         unit = f"{pixels} HRLS pixel{'s' * (pixels > 1)}"
         yield Case(f"shifted by {unit}, x and y", base.pair(scale, lr_scene=moved), clean)
 
 
+RARE = "1 sample of 200 finds the light"
 GROUPS: dict[str, Callable[[int, int], Iterator[Case]]] = {
     "fireflies": fireflies,
     "NaN, Inf, negative": broken_values,
@@ -314,12 +301,25 @@ GROUPS: dict[str, Callable[[int, int], Iterator[Case]]] = {
     "spp outside training": unusual_spp,
     "pixel footprint": footprints,
     "16-bit overflow": overflow,
-    "lights and emitters": lights,
-    "near-black": dark,
+    "lights and emitters": hard(
+        ("small lights up to 1e2", "lights 100.0", partial(analytic.small_lights, radiance=1e2)),
+        ("small lights up to 1e4", "lights 10000.0", partial(analytic.small_lights, radiance=1e4)),
+        ("small lights up to 1e6", "lights 1000000.0", partial(analytic.small_lights, radiance=1e6)),
+        ("visible emitters, one behind a grille", "emitters", analytic.emitters),
+    ),
+    "near-black": hard(
+        (RARE, "near black", analytic.near_black),
+        (f"{RARE}, traces of 1e-3 to 1e-40 elsewhere", "near black", partial(analytic.near_black, traces=1e-3)),
+    ),
     "rare light": rare_light,
     "pixel filter": filters,
-    "depth of field, motion blur": blur,
-    "hair, glass": detail,
+    "depth of field, motion blur": hard(
+        ("depth of field", "depth of field", analytic.defocused), ("motion blur", "motion blur", analytic.moving)
+    ),
+    "hair, glass": hard(
+        ("hairs of 0.1 to 0.8 pixels", "hairs", analytic.hairy),
+        ("glass that no layer sees through", "glass", analytic.glassy),
+    ),
     DISAGREE: disagreement,
 }
 """A group's name -> its cases, by the side of the frame in pixels and the scale."""

@@ -11,13 +11,9 @@ from research.datagen import command_line, views
 
 
 def main() -> int:
-    """Run the command line and return the exit code."""
     parser = command_line.parser("research.datagen.cycles", "Render training views with Blender's Cycles.", ref_spp=32)
-    parser.add_argument(
-        "--filter",
-        choices=views.FILTERS,
-        help="pixel filter of both renders; without it, the LRHS has a box filter and every fourth HRLS a wider one",
-    )
+    text = "pixel filter of both renders; without it, the LRHS has a box filter and every fourth HRLS a wider one"
+    parser.add_argument("--filter", choices=views.FILTERS, help=text)
     args = parser.parse_args()
     from .render import render_scene
 

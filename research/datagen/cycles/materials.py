@@ -15,7 +15,7 @@ from research.datagen import textures as tex
 Rng = np.random.Generator
 Material: TypeAlias = bpy.types.Material
 Socket: TypeAlias = bpy.types.NodeSocket
-_SOCKET: type = bpy.types.NodeSocket  # mypy takes no alias in isinstance
+_SOCKET, _NODE = bpy.types.NodeSocket, bpy.types.Node  # mypy takes no alias in isinstance
 
 
 def rgba(color: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float, float]:
@@ -36,28 +36,30 @@ class Graph:
 
     def __init__(self, owner: bpy.types.Material | bpy.types.World) -> None:
         owner.use_nodes = True
-        self.tree = owner.node_tree
+        self.owner, self.tree = owner, owner.node_tree
         self.tree.nodes.clear()
         self.output = self.add("ShaderNodeOutputWorld" if isinstance(owner, bpy.types.World)
                                else "ShaderNodeOutputMaterial")  # fmt: skip
 
     def add(self, kind: str, inputs: Mapping[Any, Any] | None = None, **attributes: Any) -> bpy.types.Node:
-        """Add a node; `inputs` are sockets to link, colours (3,) or numbers, `attributes` the node's own."""
+        """Add a node; `inputs` are sockets or nodes to link, colours (3,) or numbers, `attributes` the node's own."""
         node = self.tree.nodes.new(kind)
         for name, value in attributes.items():
             setattr(node, name, value)
         for key, value in (inputs or {}).items():
             socket = node.inputs[key]
-            if isinstance(value, _SOCKET):
-                self.tree.links.new(value, socket)
+            if isinstance(value, (_SOCKET, _NODE)):
+                self.tree.links.new(value if isinstance(value, _SOCKET) else value.outputs[0], socket)
             elif np.ndim(value) == 1:
                 socket.default_value = rgba(value) if socket.type == "RGBA" else [float(v) for v in value]
             else:
                 socket.default_value = float(value)
         return node
 
-    def surface(self, shader: bpy.types.Node, socket: str = "Surface") -> None:
+    def surface(self, shader: bpy.types.Node, socket: str = "Surface") -> Material:
+        """Finish with a shader; return the material."""
         self.tree.links.new(shader.outputs[0], self.output.inputs[socket])
+        return self.owner
 
     def mix(self, factor: Socket | float, a: Any, b: Any, blend: str = "MIX") -> Socket:
         """Mix two colours, (3,) or sockets."""
@@ -82,16 +84,14 @@ class Graph:
     def coordinates(self, scale: np.ndarray | float = 1.0, name: str = "Object") -> Socket:
         """Positions in metres, or the texture coordinates of a mesh (`UV`), times `scale`."""
         coords = self.add("ShaderNodeTexCoord").outputs[name]
-        scale = np.broadcast_to(np.asarray(scale, float), 3)
         # An offset keeps faces of boxes away from where 3-D patterns change.
-        return self.add(
-            "ShaderNodeMapping", {"Vector": coords, "Scale": scale, "Location": (0.013, 0.0171, 0.0213)}
-        ).outputs[0]
+        inputs = {"Vector": coords, "Scale": np.broadcast_to(scale, 3), "Location": (0.013, 0.0171, 0.0213)}
+        return self.add("ShaderNodeMapping", inputs).outputs[0]
 
 
-def new(name: str) -> tuple[Material, Graph]:
-    material = bpy.data.materials.new(name)
-    return material, Graph(material)
+def new(name: str) -> Graph:
+    """Return the empty graph of a new material."""
+    return Graph(bpy.data.materials.new(name))
 
 
 def image_node(graph: Graph, image: np.ndarray, vector: Socket, nearest: bool = False) -> Socket:
@@ -164,19 +164,9 @@ def checks(graph: Graph, rng: Rng, frequency: float) -> Socket:
 
 def planks(graph: Graph, rng: Rng, frequency: float) -> Socket:
     base = np.array([0.36, 0.18, 0.08]) * rng.uniform(0.15, 1.8) * rng.uniform(0.8, 1.2, 3)
-    boards = graph.add(
-        "ShaderNodeTexBrick",
-        {
-            "Vector": graph.coordinates(frequency, "UV"),
-            "Color1": base,
-            "Color2": base * rng.uniform(0.4, 0.9),
-            "Mortar": base * 0.1,
-            "Scale": 1,
-            "Mortar Size": 0.005,
-            "Brick Width": 1.4,
-            "Row Height": rng.uniform(0.08, 0.25),
-        },
-    )
+    inputs = {"Vector": graph.coordinates(frequency, "UV"), "Scale": 1, "Mortar Size": 0.005, "Brick Width": 1.4}
+    inputs |= {"Color1": base, "Color2": base * rng.uniform(0.4, 0.9), "Mortar": base * 0.1}
+    boards = graph.add("ShaderNodeTexBrick", inputs | {"Row Height": rng.uniform(0.08, 0.25)})
     grain = graph.add("ShaderNodeTexNoise", {"Vector": graph.coordinates(frequency * np.array([2, 40, 30]), "UV"),
                                              "Scale": 1, "Detail": 8, "Roughness": 0.65})  # fmt: skip
     return graph.mix(rng.uniform(0.3, 0.8), boards.outputs["Color"], grain.outputs[0], "OVERLAY")
@@ -194,11 +184,8 @@ def plaid(graph: Graph, rng: Rng, frequency: float) -> Socket:
 
 
 def magic(graph: Graph, rng: Rng, frequency: float) -> Socket:
-    node = graph.add(
-        "ShaderNodeTexMagic",
-        {"Vector": graph.coordinates(frequency), "Scale": 1, "Distortion": rng.uniform(0.5, 3)},
-        turbulence_depth=int(rng.integers(1, 6)),
-    )
+    inputs = {"Vector": graph.coordinates(frequency), "Scale": 1, "Distortion": rng.uniform(0.5, 3)}
+    node = graph.add("ShaderNodeTexMagic", inputs, turbulence_depth=int(rng.integers(1, 6)))
     return graph.mix(rng.uniform(0.4, 1), tex.color(rng), node.outputs["Color"], "MULTIPLY")
 
 
@@ -226,19 +213,15 @@ def bump(graph: Graph, rng: Rng, frequency: float) -> Socket:
         height = graph.add("ShaderNodeTexNoise", {"Vector": vector, "Scale": 1, "Detail": rng.uniform(1, 8)}).outputs[0]
     else:
         height = graph.add("ShaderNodeTexVoronoi", {"Vector": vector, "Scale": 1}).outputs["Distance"]
-    return graph.add(
-        "ShaderNodeBump", {"Height": height, "Strength": rng.uniform(0.1, 0.9), "Distance": 0.05 / frequency}
-    ).outputs[0]
+    inputs = {"Height": height, "Strength": rng.uniform(0.1, 0.9), "Distance": 0.05 / frequency}
+    return graph.add("ShaderNodeBump", inputs).outputs[0]
 
 
 # Materials
 
 
-def principled(name: str, rng: Rng, inputs: dict[str, Any], graph: Graph | None = None,
-               material: Material | None = None, frequency: float = 4.0, bumpy: float = 0.25) -> Material:  # fmt: skip
+def principled(graph: Graph, rng: Rng, inputs: dict[str, Any], frequency: float = 4.0, bumpy: float = 0.25) -> Material:
     """Return a Principled BSDF with some `inputs`, sometimes with a bumpy surface or a patchy roughness."""
-    if graph is None:
-        material, graph = new(name)
     if chance(rng, bumpy):
         inputs["Normal"] = bump(graph, rng, frequency)
     roughness = inputs.get("Roughness", 0.5)
@@ -246,169 +229,141 @@ def principled(name: str, rng: Rng, inputs: dict[str, Any], graph: Graph | None 
         patches = graph.add("ShaderNodeTexNoise", {"Vector": graph.coordinates(frequency), "Scale": 1, "Detail": 5})
         inputs["Roughness"] = graph.span(graph.threshold(patches.outputs[0], 0.5, 0.4), roughness * 0.4,
                                          min(roughness * 1.5 + 0.05, 1))  # fmt: skip
-    graph.surface(graph.add("ShaderNodeBsdfPrincipled", inputs))
-    return material
+    return graph.surface(graph.add("ShaderNodeBsdfPrincipled", inputs))
 
 
 def paint(rng: Rng, plainness: float = 0.35, frequency: float = 2.0, light: bool = False) -> Material:
     """Walls, floors and most things: from matt to polished."""
-    material, graph = new("paint")
+    graph = new("paint")
     base = color(graph, rng, plainness, frequency)
     if light:  # what fills the shadows of a real interior
         base = graph.mix(rng.uniform(0.5, 0.85), base, rng.uniform(0.6, 0.85) * np.array([1, 0.97, 0.92]))
     shine = rng.random()
-    roughness = (
-        rng.uniform(0.6, 1) if shine < 0.5 else rng.uniform(0.15, 0.6) if shine < 0.85 else rng.uniform(0.02, 0.15)
-    )
+    roughness = rng.uniform(*((0.6, 1) if shine < 0.5 else (0.15, 0.6) if shine < 0.85 else (0.02, 0.15)))
     inputs = {"Base Color": base, "Roughness": roughness, "Diffuse Roughness": float(chance(rng, 0.3))}
-    return principled("paint", rng, inputs, graph, material, frequency)
+    return principled(graph, rng, inputs, frequency)
 
 
 def cloth(rng: Rng, frequency: float = 8.0) -> Material:
-    material, graph = new("cloth")
+    graph = new("cloth")
     inputs = {"Base Color": color(graph, rng, 0.3, frequency), "Roughness": 0.9, "Sheen Weight": rng.uniform(0, 1),
               "Sheen Roughness": rng.uniform(0.2, 0.7), "Sheen Tint": tex.color(rng)}  # fmt: skip
-    return principled("cloth", rng, inputs, graph, material, frequency, bumpy=0.6)
+    return principled(graph, rng, inputs, frequency, bumpy=0.6)
 
 
 def metal(rng: Rng, frequency: float = 4.0) -> Material:
-    material, graph = new("metal")
+    graph = new("metal")
     tints = [(0.95, 0.64, 0.30), (0.95, 0.79, 0.52), (0.91, 0.92, 0.92), (0.55, 0.56, 0.55), (0.97, 0.96, 0.91)]
     tint = np.array(tints[rng.integers(len(tints))]) if chance(rng, 0.8) else tex.color(rng, 0.2, 0.95)
     base = tint if chance(rng, 0.7) else graph.mix(0.6, tint, color(graph, rng, 0, frequency), "MULTIPLY")
-    inputs = {
-        "Base Color": base,
-        "Metallic": 1,
-        "Roughness": 0.0 if chance(rng, 0.15) else 10 ** rng.uniform(-1.6, -0.2),
-        "Anisotropic": rng.uniform(0, 0.9) * chance(rng, 0.3),
-    }
-    return principled("metal", rng, inputs, graph, material, frequency)
+    roughness = 0.0 if chance(rng, 0.15) else 10 ** rng.uniform(-1.6, -0.2)
+    inputs = {"Base Color": base, "Metallic": 1, "Roughness": roughness}
+    inputs["Anisotropic"] = rng.uniform(0, 0.9) * chance(rng, 0.3)
+    return principled(graph, rng, inputs, frequency)
 
 
 def coated(rng: Rng, frequency: float = 4.0) -> Material:
     """Car paint, lacquer, glazed ceramics."""
-    material, graph = new("coated")
-    inputs = {
-        "Base Color": color(graph, rng, 0.6, frequency),
-        "Roughness": rng.uniform(0.2, 0.8),
-        "Metallic": rng.uniform(0, 1) * chance(rng, 0.4),
-        "Coat Weight": 1,
-        "Coat Roughness": 10 ** rng.uniform(-2, -0.7),
-        "Coat Tint": np.ones(3) if chance(rng, 0.6) else tex.color(rng, 0.3, 1),
-    }
-    return principled("coated", rng, inputs, graph, material, frequency, bumpy=0.15)
+    graph = new("coated")
+    inputs = {"Base Color": color(graph, rng, 0.6, frequency), "Roughness": rng.uniform(0.2, 0.8)}
+    inputs["Metallic"] = rng.uniform(0, 1) * chance(rng, 0.4)
+    inputs |= {"Coat Weight": 1, "Coat Roughness": 10 ** rng.uniform(-2, -0.7)}
+    inputs["Coat Tint"] = np.ones(3) if chance(rng, 0.6) else tex.color(rng, 0.3, 1)
+    return principled(graph, rng, inputs, frequency, bumpy=0.15)
 
 
 def waxen(rng: Rng, size: float) -> Material:
     """Subsurface scattering: wax, skin, soap, marble; `size` of the object in metres."""
-    material, graph = new("waxen")
-    inputs = {
-        "Base Color": np.clip(tex.color(rng, 0.3, 0.95), 0, 1),
-        "Roughness": rng.uniform(0.15, 0.6),
-        "Subsurface Weight": 1,
-        "Subsurface Radius": rng.uniform(0.2, 1, 3),
-        "Subsurface Scale": size * rng.uniform(0.03, 0.3),
-    }
-    return principled("waxen", rng, inputs, graph, material, 4 / size)
+    graph = new("waxen")
+    inputs = {"Base Color": np.clip(tex.color(rng, 0.3, 0.95), 0, 1), "Roughness": rng.uniform(0.15, 0.6)}
+    inputs |= {"Subsurface Weight": 1, "Subsurface Radius": rng.uniform(0.2, 1, 3)}
+    inputs["Subsurface Scale"] = size * rng.uniform(0.03, 0.3)
+    return principled(graph, rng, inputs, 4 / size)
 
 
 def glass(rng: Rng) -> Material:
     """For closed meshes."""
-    material, graph = new("glass")
+    graph = new("glass")
     tint = tex.color(rng, 0.5, 1.0) if chance(rng, 0.3) else np.full(3, 0.97)
     roughness = 0.0 if chance(rng, 0.65) else 10 ** rng.uniform(-1.5, -0.3)
     inputs = {"Base Color": tint, "Roughness": roughness, "IOR": rng.uniform(1.3, 1.7), "Transmission Weight": 1}
     if chance(rng, 0.1):
         inputs |= {"Thin Film Thickness": rng.uniform(200, 700), "Thin Film IOR": 1.33}
-    return principled("glass", rng, inputs, graph, material, 6.0, bumpy=0.15)
+    return principled(graph, rng, inputs, 6.0, bumpy=0.15)
 
 
 def pane(rng: Rng) -> Material:
     """Return a pane that lets shadow rays through, as users build it: Cycles would find no light behind glass."""
-    material, graph = new("pane")
+    graph = new("pane")
     path = graph.add("ShaderNodeLightPath")
     clear = graph.add("ShaderNodeBsdfTransparent", {"Color": (0.92, 0.95, 0.93)})
     fresnel = graph.add("ShaderNodeFresnel", {"IOR": 1.45})
     gloss = graph.add("ShaderNodeBsdfAnisotropic", {"Color": np.ones(3), "Roughness": rng.uniform(0, 0.05)})
-    seen = graph.add("ShaderNodeMixShader", {0: fresnel.outputs[0], 1: clear.outputs[0], 2: gloss.outputs[0]})
-    graph.surface(
-        graph.add("ShaderNodeMixShader", {0: path.outputs["Is Shadow Ray"], 1: seen.outputs[0], 2: clear.outputs[0]})
-    )
-    return material
+    seen = graph.add("ShaderNodeMixShader", {0: fresnel, 1: clear, 2: gloss})
+    return graph.surface(graph.add("ShaderNodeMixShader", {0: path.outputs["Is Shadow Ray"], 1: seen, 2: clear}))
 
 
 def leaf(rng: Rng) -> Material:
     """Thin and translucent; the colour varies with u from leaf to leaf and from object to object."""
-    material, graph = new("leaf")
+    graph = new("leaf")
     base = image_node(graph, tex.foliage(rng), graph.add("ShaderNodeTexCoord").outputs["UV"])
     front = graph.add("ShaderNodeBsdfPrincipled", {"Base Color": base, "Roughness": rng.uniform(0.25, 0.6),
                                                    "Specular IOR Level": 0.5 * chance(rng, 0.5)})  # fmt: skip
     back = graph.add("ShaderNodeBsdfTranslucent", {"Color": base})
-    graph.surface(graph.add("ShaderNodeMixShader", {0: rng.uniform(0.1, 0.5), 1: front.outputs[0], 2: back.outputs[0]}))
-    return material
+    return graph.surface(graph.add("ShaderNodeMixShader", {0: rng.uniform(0.1, 0.5), 1: front, 2: back}))
 
 
 def shade(rng: Rng) -> Material:
     """Lampshades and curtains: light passes, diffused."""
-    material, graph = new("shade")
+    graph = new("shade")
     base = color(graph, rng, 0.6, 10.0)
     base = graph.mix(0.6, base, np.array([0.9, 0.85, 0.75]))
     front = graph.add("ShaderNodeBsdfDiffuse", {"Color": base})
     back = graph.add("ShaderNodeBsdfTranslucent", {"Color": base})
-    graph.surface(
-        graph.add("ShaderNodeMixShader", {0: rng.uniform(0.15, 0.6), 1: front.outputs[0], 2: back.outputs[0]})
-    )
-    return material
+    return graph.surface(graph.add("ShaderNodeMixShader", {0: rng.uniform(0.15, 0.6), 1: front, 2: back}))
 
 
 def palette(rng: Rng) -> Material:
     """Return a bitmap of unrelated colours, for meshes whose parts each take one."""
-    material, graph = new("palette")
+    graph = new("palette")
     base = image_node(graph, tex.palette(rng), graph.add("ShaderNodeTexCoord").outputs["UV"], nearest=True)
-    return principled("palette", rng, {"Base Color": base, "Roughness": rng.uniform(0.2, 0.9)}, graph, material, 10.0)
+    return principled(graph, rng, {"Base Color": base, "Roughness": rng.uniform(0.2, 0.9)}, 10.0)
 
 
 def hair(rng: Rng) -> Material:
-    material, graph = new("hair")
+    graph = new("hair")
     if chance(rng, 0.5):
         node = graph.add("ShaderNodeBsdfHairPrincipled", {"Roughness": rng.uniform(0.15, 0.5)}, parametrization="COLOR")
         node.inputs["Color"].default_value = rgba(tex.color(rng, 0.05, 0.9))
-        graph.surface(node)
-    else:
-        graph.surface(graph.add("ShaderNodeBsdfDiffuse", {"Color": tex.color(rng)}))
-    return material
+        return graph.surface(node)
+    return graph.surface(graph.add("ShaderNodeBsdfDiffuse", {"Color": tex.color(rng)}))
 
 
 def picture(image: np.ndarray, rng: Rng) -> Material:
     """Return an image over the whole unit square of the texture coordinates."""
-    material, graph = new("picture")
+    graph = new("picture")
     base = image_node(graph, image, graph.add("ShaderNodeTexCoord").outputs["UV"])
-    return principled(
-        "picture", rng, {"Base Color": base, "Roughness": rng.uniform(0.05, 0.9)}, graph, material, bumpy=0.1
-    )
+    return principled(graph, rng, {"Base Color": base, "Roughness": rng.uniform(0.05, 0.9)}, bumpy=0.1)
 
 
 def lamp(radiance: np.ndarray) -> Material:
-    material, graph = new("lamp")
+    graph = new("lamp")
     strength = float(np.max(radiance))
-    graph.surface(graph.add("ShaderNodeEmission", {"Color": radiance / max(strength, 1e-9), "Strength": strength}))
-    return material
+    inputs = {"Color": radiance / max(strength, 1e-9), "Strength": strength}
+    return graph.surface(graph.add("ShaderNodeEmission", inputs))
 
 
 def screen(rng: Rng, strength: float) -> Material:
     """Return a display, neon sign or lit poster: an emitter with an image."""
-    material, graph = new("screen")
+    graph = new("screen")
     base = image_node(graph, tex.pattern(rng, 0.0), graph.add("ShaderNodeTexCoord").outputs["UV"])
-    graph.surface(graph.add("ShaderNodeEmission", {"Color": base, "Strength": strength}))
-    return material
+    return graph.surface(graph.add("ShaderNodeEmission", {"Color": base, "Strength": strength}))
 
 
 def fog(rng: Rng, density: float) -> Material:
-    material, graph = new("fog")
-    volume = graph.add("ShaderNodeVolumeScatter", {"Color": 1 - 0.2 * rng.random(3), "Density": density,
-                                                   "Anisotropy": rng.uniform(0, 0.8)})  # fmt: skip
-    graph.surface(volume, "Volume")
-    return material
+    graph = new("fog")
+    inputs = {"Color": 1 - 0.2 * rng.random(3), "Density": density, "Anisotropy": rng.uniform(0, 0.8)}
+    return graph.surface(graph.add("ShaderNodeVolumeScatter", inputs), "Volume")
 
 
 def thing(rng: Rng, size: float, shiny: float = 0.25, clear: float = 0.1) -> Material:

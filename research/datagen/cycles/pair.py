@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import math
 import random
-import sys
 import time
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -66,6 +65,22 @@ def mix_colors(nt: Any, factor: Any, a: Any, b: Any, blend: str = "MIX") -> Any:
     return next(s for s in n.outputs if s.type == "RGBA")
 
 
+def ramp(nt: Any, factor: Any, low: tuple[float, Colour], high: tuple[float, Colour]) -> Any:
+    """Map a factor to a colour between two, each at a value of the factor."""
+    n = nt.nodes.new("ShaderNodeValToRGB")
+    for element, (position, color) in zip(n.color_ramp.elements, (low, high), strict=True):
+        element.position, element.color = position, color
+    nt.links.new(factor, n.inputs[0])
+    return n.outputs["Color"]
+
+
+def stripes(nt: Any, vector: Any, scale: float, direction: str) -> Any:
+    wave = node(nt, "ShaderNodeTexWave", Scale=scale, Distortion=0.0)
+    wave.bands_direction = direction
+    nt.links.new(vector, wave.inputs["Vector"])
+    return wave.outputs["Fac" if "Fac" in wave.outputs else 1]
+
+
 def wood_floor() -> Material:
     mat, nt, bsdf = new_material("Wood Floor", Roughness=0.32)
     planks = node(
@@ -82,15 +97,9 @@ def wood_floor() -> Material:
 
 def wallpaper() -> Material:
     mat, nt, bsdf = new_material("Wallpaper", Roughness=0.8)
-    wave = node(nt, "ShaderNodeTexWave", Scale=2.1, Distortion=0.0)
-    wave.bands_direction = "X"
-    nt.links.new(object_coords(nt), wave.inputs["Vector"])
-    ramp = nt.nodes.new("ShaderNodeValToRGB")
-    ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.47, 0.53
-    ramp.color_ramp.elements[0].color = rgb(0.33, 0.45, 0.42)
-    ramp.color_ramp.elements[1].color = rgb(0.42, 0.54, 0.49)
-    nt.links.new(wave.outputs["Fac" if "Fac" in wave.outputs else 1], ramp.inputs[0])
-    nt.links.new(ramp.outputs["Color"], bsdf.inputs["Base Color"])
+    factor = stripes(nt, object_coords(nt), 2.1, "X")
+    colour = ramp(nt, factor, (0.47, rgb(0.33, 0.45, 0.42)), (0.53, rgb(0.42, 0.54, 0.49)))
+    nt.links.new(colour, bsdf.inputs["Base Color"])
     return mat
 
 
@@ -110,15 +119,8 @@ def tablecloth() -> Material:
     mat, nt, bsdf = new_material("Cloth", Roughness=0.9, Sheen_Weight=0.4)
     color, flat = rgb(0.76, 0.71, 0.62), nt.nodes.new("ShaderNodeTexCoord").outputs["UV"]
     for direction, tint in (("X", rgb(0.55, 0.06, 0.05)), ("Y", rgb(0.10, 0.14, 0.34))):
-        wave = node(nt, "ShaderNodeTexWave", Scale=3.4, Distortion=0.0)
-        wave.bands_direction = direction
-        nt.links.new(flat, wave.inputs["Vector"])
-        ramp = nt.nodes.new("ShaderNodeValToRGB")
-        ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.62, 0.70
-        ramp.color_ramp.elements[0].color = rgb(0, 0, 0)
-        ramp.color_ramp.elements[1].color = rgb(0.8, 0.8, 0.8)
-        nt.links.new(wave.outputs["Fac" if "Fac" in wave.outputs else 1], ramp.inputs[0])
-        color = mix_colors(nt, ramp.outputs["Color"], color, tint)
+        factor = stripes(nt, flat, 3.4, direction)
+        color = mix_colors(nt, ramp(nt, factor, (0.62, rgb(0, 0, 0)), (0.70, rgb(0.8, 0.8, 0.8))), color, tint)
     nt.links.new(color, bsdf.inputs["Base Color"])
     return mat
 
@@ -151,10 +153,9 @@ def glass() -> Material:
 
 
 # ----------------------------------------------------------------- geometry
-def finish(ob: Any, mat: Material | None = None, smooth: bool = False) -> Any:
+def finish(ob: Any, mat: Material, smooth: bool = False) -> Any:
     """Give an object its material and smoothness."""
-    if mat is not None:
-        ob.data.materials.append(mat)
+    ob.data.materials.append(mat)
     if smooth:
         ob.data.polygons.foreach_set("use_smooth", [True] * len(ob.data.polygons))
     return ob
@@ -387,12 +388,9 @@ def build_scene(seed: int) -> Any:
     back = next(n for n in nt.nodes if n.type == "BACKGROUND")
     coords = nt.nodes.new("ShaderNodeTexCoord")
     split = nt.nodes.new("ShaderNodeSeparateXYZ")
-    ramp = nt.nodes.new("ShaderNodeValToRGB")
-    ramp.color_ramp.elements[0].color = rgb(0.90, 0.93, 0.95)
-    ramp.color_ramp.elements[1].color = rgb(0.30, 0.50, 0.95)
     nt.links.new(coords.outputs["Generated"], split.inputs[0])
-    nt.links.new(split.outputs["Z"], ramp.inputs[0])
-    nt.links.new(ramp.outputs["Color"], back.inputs["Color"])
+    sky = ramp(nt, split.outputs["Z"], (0, rgb(0.90, 0.93, 0.95)), (1, rgb(0.30, 0.50, 0.95)))
+    nt.links.new(sky, back.inputs["Color"])
     back.inputs["Strength"].default_value = 0.62
     world.cycles.sampling_method = "MANUAL"
     world.cycles.sample_map_resolution = 512
@@ -451,10 +449,11 @@ def render(scene: Any, path: Path, size: tuple[int, int], spp: int, seed: int) -
     print(f"{path.name}: {size[0]}x{size[1]}, {spp} spp, seed {seed}, {took:.1f} s", flush=True)
 
 
-def parse(argv: list[str]) -> argparse.Namespace:
-    def size(text: str) -> tuple[int, ...]:
-        return tuple(int(v) for v in text.lower().split("x"))
+def size(text: str) -> tuple[int, ...]:
+    return tuple(int(v) for v in text.lower().split("x"))
 
+
+def main() -> None:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--out", type=Path, required=True, metavar="DIR")
     p.add_argument("--size", type=size, default=(512, 384), metavar="WxH", help="size of the HRLS render")
@@ -464,11 +463,7 @@ def parse(argv: list[str]) -> argparse.Namespace:
     p.add_argument("--ref-spp", type=int, default=0, help="0: no reference")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--threads", type=int, default=1)
-    return p.parse_args(argv)
-
-
-def main(argv: list[str]) -> None:
-    args = parse(argv)
+    args = p.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     scene = build_scene(args.seed)
     configure(scene, args)
@@ -477,11 +472,10 @@ def main(argv: list[str]) -> None:
     low = -(-w // args.scale), -(-h // args.scale)
     # every render has a seed of its own, else the samples of one would be nested in another's
     jobs = [("hr", (w, h), args.hr_spp, 1), ("lr", low, args.lr_spp, 2), ("ref", (w, h), args.ref_spp, 3)]
-    for name, size, spp, offset in jobs:
+    for name, pixels, spp, offset in jobs:
         if spp > 0:
-            path = args.out.resolve() / f"{name}.exr"
-            render(scene, path, size, spp, 1000 * args.seed + offset)
+            render(scene, args.out.resolve() / f"{name}.exr", pixels, spp, 1000 * args.seed + offset)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -16,12 +16,12 @@ import argparse
 import itertools
 import tempfile
 import time
-import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import bpy
+import bpy
+
+from . import scenes
+from .render import Renderer, find_cameras, write_frame
 
 #: Width and height; multiples of every scale.
 SIZE = (384, 216)
@@ -62,11 +62,6 @@ def group_lights(scene: bpy.types.Scene) -> None:
 
 def render(out: Path, seed: int, pixel_filter: str, size: tuple[int, int], reference: int, threads: int) -> None:
     """Render the files of one seed that do not exist yet. ``reference`` is in spp; 0 for none."""
-    import bpy
-
-    from . import scenes
-    from .render import Renderer, find_cameras
-
     folder = out / f"cycles_{seed}_{pixel_filter.lower()}"
     jobs = [(f"hr_{spp}spp", 1, spp) for spp in HRLS]
     jobs += [(f"lr_x{scale}_{scale**2 * spp}spp", scale, scale**2 * spp) for scale in SCALES for spp in LRHS]
@@ -90,12 +85,7 @@ def render(out: Path, seed: int, pixel_filter: str, size: tuple[int, int], refer
     image.color_depth, image.exr_codec = "16", "ZIP"
     scene.cycles.pixel_filter_type, scene.cycles.filter_width = pixel_filter, 1.5
     for name, scale, spp in missing:
-        path = folder / f"{name}.exr"
-        scene.render.resolution_x, scene.render.resolution_y = (side // scale for side in size)
-        scene.cycles.samples, scene.cycles.seed = spp, zlib.crc32(f"{seed} {name}".encode()) % 2**31
-        scene.render.filepath = str(path.with_name(f"{name}.part.exr"))
-        bpy.ops.render.render(write_still=True)
-        path.with_name(f"{name}.part.exr").replace(path)
+        write_frame(scene, folder / f"{name}.exr", [side // scale for side in size], spp, f"{seed} {name}")
 
 
 def main() -> None:

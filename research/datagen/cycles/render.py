@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -23,7 +24,31 @@ _ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most ren
 # scenes help more than clean ones. Validation and test references must be clean.
 _REFERENCE = {"train": (24.0, 20.0, 2), "validation": (28.0, 20.0, 4), "test": (40.0, 30.0, 12)}
 _LIGHT_PASSES = [f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color")]
-_FILTERS = {"BOX": "box", "BLACKMAN_HARRIS": "blackman-harris"}
+
+
+def set_up(scene: bpy.types.Scene, threads: int, codec: str) -> None:
+    """Set Cycles to the CPU, without whatever would change samples, and its output to a multi-layer EXR of floats."""
+    scene.render.engine = "CYCLES"
+    c, r = scene.cycles, scene.render
+    c.device = "CPU"
+    c.use_denoising = c.use_adaptive_sampling = c.use_animated_seed = False
+    c.sample_clamp_direct = c.sample_clamp_indirect = 0.0
+    r.threads_mode, r.threads = "FIXED", threads
+    r.use_compositing = r.use_sequencer = r.film_transparent = False
+    r.resolution_percentage, r.dither_intensity = 100, 0.0
+    image = r.image_settings
+    image.media_type, image.file_format = "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER"
+    image.color_depth, image.exr_codec, image.use_exr_interleave = "32", codec, True
+
+
+def write_frame(scene: bpy.types.Scene, path: Path, size: Sequence[int], spp: int, title: str) -> None:
+    """Render a file of Blender's own; the random numbers follow from the title. It appears when it is complete."""
+    part = path.with_name(f"{path.stem}.part.exr")
+    scene.render.resolution_x, scene.render.resolution_y = size
+    scene.cycles.samples, scene.cycles.seed = spp, zlib.crc32(title.encode()) % 2**31
+    scene.render.filepath = str(part)
+    bpy.ops.render.render(write_still=True)
+    part.replace(path)
 
 
 class Renderer:
@@ -32,12 +57,8 @@ class Renderer:
     def __init__(self, scratch: Path, stage: scenes.Stage, threads: int) -> None:
         self._file = scratch / "render.exr"
         self._scene = scene = stage.scene
-        rng = stage.rng
-        scene.render.engine = "CYCLES"
-        c = scene.cycles
-        c.device = "CPU"
-        c.use_denoising = c.use_adaptive_sampling = c.use_animated_seed = False
-        c.sample_clamp_direct = c.sample_clamp_indirect = 0.0
+        set_up(scene, threads, "NONE")
+        rng, c, r = stage.rng, scene.cycles, scene.render
         c.caustics_reflective = c.caustics_refractive = stage.caustics
         c.blur_glossy = 0.0 if rng.random() < 0.5 else 1.0  # "Filter Glossy": 1 is Blender's default
         # Blender's default amounts to blue noise in final renders.
@@ -47,16 +68,7 @@ class Renderer:
         c.diffuse_bounces = c.glossy_bounces = limit
         c.transmission_bounces = c.max_bounces
         c.volume_bounces = 2
-        r = scene.render
-        r.threads_mode, r.threads = "FIXED", threads
-        r.use_persistent_data = True
-        r.use_compositing = r.use_sequencer = False
-        r.resolution_percentage, r.dither_intensity = 100, 0.0
-        r.film_transparent = False
-        r.filepath = str(self._file)
-        image = r.image_settings
-        image.media_type, image.file_format = "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER"
-        image.color_depth, image.exr_codec, image.use_exr_interleave = "32", "NONE", True
+        r.use_persistent_data, r.filepath = True, str(self._file)
         self.settings = {
             "sampler": c.sampling_pattern.lower(), "bounces": c.max_bounces, "diffuse_bounces": limit,
             "caustics": stage.caustics, "motion_blur": r.use_motion_blur,
@@ -139,7 +151,7 @@ def render_view(
     pixel_filter = "BLACKMAN_HARRIS" if seed % 4 == 3 else "BOX"
     lr_filter = "BOX"
     if filter_name is not None:
-        pixel_filter = lr_filter = next(kind for kind, name in _FILTERS.items() if name == filter_name)
+        pixel_filter = lr_filter = filter_name.upper().replace("-", "_")
     # Box-filtered passes at full resolution give the LRHS of every scale. A wider filter needs a render per scale.
     scales = (1,) if lr_filter == "BOX" else SCALES
 
@@ -169,10 +181,15 @@ def render_view(
     meta = {
         "seed": f"cycles-{seed}", "view": view, "split": views.split_of(seed), "generator": scenes.VERSION,
         "kind": stage.kind, "renderer": f"Blender {bpy.app.version_string} Cycles", **renderer.settings,
-        "filter": _FILTERS[pixel_filter], "lr_filter": _FILTERS[lr_filter], "ref_spp": spent, "ref_psnr": psnr,
+        "filter": _name_of(pixel_filter), "lr_filter": _name_of(lr_filter), "ref_spp": spent, "ref_psnr": psnr,
         "camera": camera,
     }  # fmt: skip
     return views.pack(hr, lr, ref, rng, meta)
+
+
+def _name_of(pixel_filter: str) -> str:
+    """Return one of `views.FILTERS` by its name in Blender."""
+    return pixel_filter.lower().replace("_", "-")
 
 
 def render_scene(

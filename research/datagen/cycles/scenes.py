@@ -19,9 +19,8 @@ from research.datagen import meshes as geo
 from research.datagen import textures as tex
 
 from . import materials as mat
-from .geometry import blender_mesh
 from .materials import Rng, chance, log_uniform
-from .stage import Stage
+from .stage import Stage, blender_mesh
 
 VERSION = 1  # of the generator: raise it when a seed would give another scene
 
@@ -166,16 +165,13 @@ def street(s: Stage) -> None:
     """Night: lit windows, street lamps, signs, wet ground, often mist."""
     rng = s.rng
     s.dim_world(log_uniform(rng, 0.0005, 0.05))
-    material, graph = mat.new("asphalt")
-    wet = graph.add(
-        "ShaderNodeTexNoise", {"Vector": graph.coordinates(rng.uniform(0.3, 2)), "Scale": 1, "Detail": 6}
-    ).outputs[0]
-    rough = graph.span(graph.threshold(wet, 0.5, 0.15), rng.uniform(0.0, 0.15), rng.uniform(0.3, 0.9))
-    inputs = {
-        "Base Color": mat.color(graph, rng, 0.3, 2.0) if chance(rng, 0.5) else tex.color(rng, 0.02, 0.2),
-        "Roughness": rough,
-    }
-    s.add(geo.rectangle(60, 60), mat.principled("asphalt", rng, inputs, graph, material, 8.0, 0.7))
+    graph = mat.new("asphalt")
+    puddles = {"Vector": graph.coordinates(rng.uniform(0.3, 2)), "Scale": 1, "Detail": 6}
+    wet = graph.threshold(graph.add("ShaderNodeTexNoise", puddles).outputs[0], 0.5, 0.15)
+    rough = graph.span(wet, rng.uniform(0.0, 0.15), rng.uniform(0.3, 0.9))
+    base = mat.color(graph, rng, 0.3, 2.0) if chance(rng, 0.5) else tex.color(rng, 0.02, 0.2)
+    asphalt = mat.principled(graph, rng, {"Base Color": base, "Roughness": rough}, 8.0, 0.7)
+    s.add(geo.rectangle(60, 60), asphalt)
     for side in (-1, 1):
         y = -9.0
         while y < 9:

@@ -14,15 +14,14 @@ from __future__ import annotations
 import argparse
 import math
 import time
-import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+import bpy
 import numpy as np
 import OpenImageIO as oiio
 
-if TYPE_CHECKING:
-    import bpy
+from . import materials as mat
+from .render import set_up, write_frame
 
 #: Width and height; multiples of every scale.
 SIZE = (320, 180)
@@ -33,30 +32,19 @@ TRUCK, SLIDE, TURN = 0.035, -0.05, 0.05
 
 def material(
     name: str, kind: str, scale: float, colours: tuple[tuple[float, ...], tuple[float, ...]], roughness: float
-) -> Any:
+) -> mat.Material:
     """Make a procedural texture of two colours."""
-    import bpy
-
-    made = bpy.data.materials.new(name)
-    made.use_nodes = True
-    nodes, links = made.node_tree.nodes, made.node_tree.links
-    shader = nodes["Principled BSDF"]
-    shader.inputs["Roughness"].default_value = roughness
-    texture = nodes.new(kind)
-    texture.inputs["Scale"].default_value = scale
-    ramp = nodes.new("ShaderNodeValToRGB")
+    graph = mat.new(name)
+    place = graph.add("ShaderNodeTexCoord").outputs["Object"]
+    texture = graph.add(kind, {"Vector": place, "Scale": scale})
+    ramp = graph.add("ShaderNodeValToRGB", {"Fac": texture.outputs.get("Fac") or texture})
     for element, colour in zip(ramp.color_ramp.elements, colours, strict=True):
         element.color = (*colour, 1)
-    links.new(nodes.new("ShaderNodeTexCoord").outputs["Object"], texture.inputs["Vector"])
-    links.new(texture.outputs.get("Fac") or texture.outputs[0], ramp.inputs["Fac"])
-    links.new(ramp.outputs["Color"], shader.inputs["Base Color"])
-    return made
+    return graph.surface(graph.add("ShaderNodeBsdfPrincipled", {"Base Color": ramp, "Roughness": roughness}))
 
 
 def build() -> None:
     """Make the room. The cube that moves has the pass index 1."""
-    import bpy
-
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
     scene = bpy.context.scene
@@ -98,29 +86,6 @@ def build() -> None:
         cube.keyframe_insert("rotation_euler", frame=frame)
 
 
-def set_up(threads: int) -> None:
-    """Set what all files share."""
-    import bpy
-
-    scene = bpy.context.scene
-    scene.render.engine = "CYCLES"
-    settings, output = scene.cycles, scene.render
-    settings.device, settings.pixel_filter_type = "CPU", "BOX"
-    settings.use_denoising = settings.use_adaptive_sampling = False
-    settings.sample_clamp_indirect = 0.0
-    settings.max_bounces = 8
-    settings.caustics_reflective = settings.caustics_refractive = False
-    output.threads_mode, output.threads = "FIXED", threads
-    output.use_motion_blur = output.use_compositing = output.use_sequencer = False
-    output.resolution_percentage, output.dither_intensity = 100, 0.0
-    image = output.image_settings
-    image.media_type, image.file_format = "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER"
-    image.color_depth, image.exr_codec, image.use_exr_interleave = "32", "ZIP", True
-    layer = scene.view_layers[0]
-    layer.use_pass_vector = layer.use_pass_object_index = layer.use_pass_position = True
-    layer.cycles.denoising_store_passes = True
-
-
 def write_mask(render: Path, path: Path) -> None:
     """Where the moving object is in a render."""
     image = oiio.ImageBuf(str(render))
@@ -140,24 +105,22 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
-    import bpy
-
     folder = (args.out / "cycles" / "slide").absolute()
     build()
-    set_up(args.threads)
     scene, start = bpy.context.scene, time.perf_counter()
+    set_up(scene, args.threads, "ZIP")
+    scene.cycles.pixel_filter_type, scene.cycles.max_bounces = "BOX", 8
+    scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = scene.render.use_motion_blur = False
+    layer = scene.view_layers[0]
+    layer.use_pass_vector = layer.use_pass_object_index = layer.use_pass_position = True
+    layer.cycles.denoising_store_passes = True
     kinds = [("hr", 1, 1), ("full", 1, 2), *((f"lr_x{s}", s, s * s) for s in SCALES)]
     for frame in range(1, FRAMES + 1):
         scene.frame_set(frame)
         for kind, scale, spp in [*kinds, *((f"ref_{half}", 1, REFERENCE_HALF) for half in "ab")]:
             path = folder / f"{kind}.{frame:04d}.exr"
-            if path.exists():
-                continue
-            scene.render.resolution_x, scene.render.resolution_y = (side // scale for side in SIZE)
-            scene.cycles.samples, scene.cycles.seed = spp, zlib.crc32(path.name.encode()) % 2**31
-            scene.render.filepath = str(path.with_name("part.exr"))
-            bpy.ops.render.render(write_still=True)
-            path.with_name("part.exr").replace(path)
+            if not path.exists():
+                write_frame(scene, path, [side // scale for side in SIZE], spp, path.name)
         write_mask(folder / f"hr.{frame:04d}.exr", folder / f"mask.{frame:04d}.exr")
         print(f"frame {frame}: {time.perf_counter() - start:.0f} s", flush=True)
 

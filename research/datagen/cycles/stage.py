@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -17,8 +18,49 @@ from research.datagen import textures as tex
 from research.datagen.meshes import Mesh
 
 from . import materials as mat
-from .geometry import blender_mesh, from_bmesh, strands
 from .materials import Material, Rng, chance, log_uniform
+
+
+def blender_mesh(mesh: Mesh) -> bpy.types.Mesh:
+    data = bpy.data.meshes.new("mesh")
+    count = len(mesh.f)
+    data.vertices.add(len(mesh.v))
+    data.vertices.foreach_set("co", np.ascontiguousarray(mesh.v, np.float32).ravel())
+    data.loops.add(3 * count)
+    data.loops.foreach_set("vertex_index", np.ascontiguousarray(mesh.f, np.int32).ravel())
+    data.polygons.add(count)
+    data.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
+    data.polygons.foreach_set("use_smooth", np.full(count, mesh.n is not None))
+    uv = data.uv_layers.new(name="UV")
+    uv.uv.foreach_set("vector", np.ascontiguousarray(mesh.uv[mesh.f.ravel()], np.float32).ravel())
+    data.update(calc_edges=True)
+    if mesh.n is not None:
+        data.normals_split_custom_set_from_vertices(np.asarray(mesh.n, np.float32))
+    return data
+
+
+def from_bmesh(built: bmesh.types.BMesh, smooth: bool) -> bpy.types.Mesh:
+    data = bpy.data.meshes.new("shape")
+    uv = built.loops.layers.uv.new("UV")
+    for face in built.faces:
+        for loop in face.loops:
+            loop[uv].uv = (loop.vert.co.x + 0.5 * loop.vert.co.z, loop.vert.co.y + 0.5 * loop.vert.co.z)
+    built.to_mesh(data)
+    built.free()
+    if smooth:
+        data.shade_smooth()
+    return data
+
+
+def strands(path: np.ndarray, radius: float) -> bpy.types.HairCurves:
+    """Hair along (K, N, 3) points, thinning towards the tip."""
+    count, steps, _ = path.shape
+    data = bpy.data.hair_curves.new("hair")
+    data.add_curves([steps] * count)
+    data.position_data.foreach_set("vector", np.ascontiguousarray(path, np.float32).ravel())
+    attribute = data.attributes.get("radius") or data.attributes.new("radius", "FLOAT", "POINT")
+    attribute.data.foreach_set("value", np.tile(np.linspace(radius, 0.2 * radius, steps, dtype=np.float32), count))
+    return data
 
 
 class Stage:
@@ -44,9 +86,10 @@ class Stage:
     # -- building blocks ---------------------------------------------------------------------------
 
     def place(
-        self, data: bpy.types.ID, material: Material | None = None, matrix: Matrix | None = None
+        self, data: Mesh | bpy.types.ID, material: Material | None = None, matrix: Matrix | None = None
     ) -> bpy.types.Object:
-        """Add an object of a mesh, curve or light; several objects may share the data."""
+        """Add an object of a mesh, curve or light; several objects may share Blender's data."""
+        data = blender_mesh(data) if isinstance(data, Mesh) else data
         o = bpy.data.objects.new(data.name, data)
         if material is not None and not data.materials:
             data.materials.append(material)
@@ -56,7 +99,7 @@ class Stage:
         return o
 
     def add(self, mesh: Mesh, material: Material, at: np.ndarray | tuple = (0, 0, 0)) -> bpy.types.Object:
-        return self.place(blender_mesh(mesh), material, Matrix.Translation(Vector(map(float, at))))
+        return self.place(mesh, material, Matrix.Translation(Vector(map(float, at))))
 
     def lamp(self, kind: str, at: np.ndarray, energy: float, color: np.ndarray, target: np.ndarray | None = None,
              **attributes: object) -> bpy.types.Object:  # fmt: skip
@@ -279,11 +322,8 @@ class Stage:
     def _candle(self, at: np.ndarray, size: float) -> None:
         rng = self.rng
         r, h = size * rng.uniform(0.1, 0.3), size * rng.uniform(0.3, 0.9)
-        self.add(
-            geo.lathe(np.array([[1e-4, 0], [r, 0], [r, h], [r * 0.8, h * 0.96], [1e-4, h * 0.94]])),
-            mat.waxen(rng, r),
-            at,
-        )
+        wax = geo.lathe(np.array([[1e-4, 0], [r, 0], [r, h], [r * 0.8, h * 0.96], [1e-4, h * 0.94]]))
+        self.add(wax, mat.waxen(rng, r), at)
         if chance(rng, 0.6):
             flame = geo.sphere(1, 12).scaled((0.06 * size, 0.06 * size, 0.14 * size)).moved(0, 0, h + 0.1 * size)
             self.emitter(flame, log_uniform(rng, 0.05, 1.0), np.array([1, 0.5, 0.15]), at)
@@ -293,39 +333,27 @@ class Stage:
         rng, kind = self.rng, self.rng.random()
         self.focus.append(at + (0, 0, rng.uniform(0.3, 0.9)))
         spin = Matrix.Translation(Vector(at)) @ Matrix.Rotation(angle, 4, "Z")
-
-        def build(mesh: Mesh, material: Material) -> None:
-            self.place(blender_mesh(mesh), material, spin)
-
         if kind < 0.55:
             w, d, h = rng.uniform(0.5, 1.8), rng.uniform(0.5, 0.9), rng.uniform(0.35, 0.9)
-            build(
-                geo.table(w, d, h, rng.uniform(0.015, 0.08)),
-                mat.paint(rng, 0.25, 2) if chance(rng, 0.8) else mat.glass(rng),
-            )
+            table = geo.table(w, d, h, rng.uniform(0.015, 0.08))
+            self.place(table, mat.paint(rng, 0.25, 2) if chance(rng, 0.8) else mat.glass(rng), spin)
             self.tops.append((at + (0, 0, h), w * 0.35, d * 0.35))
         elif kind < 0.72:
             w, h, boards = rng.uniform(0.6, 1.5), rng.uniform(0.8, 2.1), int(rng.integers(2, 7))
-            build(geo.shelf(w, 0.3, h, boards), mat.paint(rng, 0.4, 2))
+            self.place(geo.shelf(w, 0.3, h, boards), mat.paint(rng, 0.4, 2), spin)
             rows = [geo.books(rng, w * 0.9, 0.2, h / boards).moved(0, 0, i * h / boards + 0.02) for i in range(boards)]
-            build(geo.merge(rows), mat.palette(rng))
+            self.place(geo.merge(rows), mat.palette(rng), spin)
         elif kind < 0.86:
             self._seat(spin)
         else:
             w, d, h = rng.uniform(0.4, 1.3), rng.uniform(0.35, 0.6), rng.uniform(0.4, 1.9)
-            build(geo.block(w, d, h), mat.paint(rng, 0.3, 2))
-            for i in range(int(rng.integers(1, 5))):  # drawers and handles
+            self.place(geo.block(w, d, h), mat.paint(rng, 0.3, 2), spin)
+            for i in range(int(rng.integers(1, 5))):
                 z = h * (i + 0.5) / 5
-                build(
-                    geo.box((-w * 0.45, -d / 2 - 0.01, z - h * 0.08), (w * 0.45, -d / 2, z + h * 0.08)),
-                    mat.paint(rng, 0.6, 3),
-                )
-                build(
-                    geo.tube(
-                        np.array([[-0.06, -d / 2 - 0.04, z], [0, -d / 2 - 0.045, z], [0.06, -d / 2 - 0.04, z]]), 0.006
-                    ),
-                    mat.metal(rng),
-                )
+                drawer = geo.box((-w * 0.45, -d / 2 - 0.01, z - h * 0.08), (w * 0.45, -d / 2, z + h * 0.08))
+                self.place(drawer, mat.paint(rng, 0.6, 3), spin)
+                handle = np.array([[-0.06, -d / 2 - 0.04, z], [0, -d / 2 - 0.045, z], [0.06, -d / 2 - 0.04, z]])
+                self.place(geo.tube(handle, 0.006), mat.metal(rng), spin)
             self.tops.append((at + (0, 0, h), w * 0.35, d * 0.35))
 
     def _seat(self, spin: Matrix) -> None:
@@ -340,15 +368,12 @@ class Stage:
             o = self.place(from_bmesh(cube, True), material, spin)
             bevel = o.modifiers.new("soft", "BEVEL")
             bevel.width, bevel.segments = min(extent) * 0.3, 4
-        legs = [
-            geo.tube(np.array([[x, y, 0], [x, y, 0.15], [x, y, 0.3]]), 0.012)
-            for x in (-w * 0.45, w * 0.45)
-            for y in (-0.3, 0.3)
-        ]
-        self.place(blender_mesh(geo.merge(legs)), mat.metal(rng), spin)
+        feet = itertools.product((-w * 0.45, w * 0.45), (-0.3, 0.3))
+        legs = [geo.tube(np.array([[x, y, 0], [x, y, 0.15], [x, y, 0.3]]), 0.012) for x, y in feet]
+        self.place(geo.merge(legs), mat.metal(rng), spin)
         for _ in range(int(rng.integers(0, 4))):
             pillow = geo.blob(rng, 0.22, 0.15).scaled((1, 0.45, 1)).moved(rng.uniform(-w / 3, w / 3), 0.1, 0.7)
-            self.place(blender_mesh(pillow), mat.cloth(rng, 12), spin)
+            self.place(pillow, mat.cloth(rng, 12), spin)
 
     def clutter(self, low: int, high: int, shiny: float = 0.25, clear: float = 0.12) -> None:
         """Small things on every surface so far."""
@@ -381,11 +406,10 @@ class Stage:
             holes[side].append((x0, z0, x0 + a, z1))
         for side in range(4):
             length = (w, d)[side % 2]
-            spin = Matrix.Rotation(side * math.pi / 2, 4, "Z") @ Matrix.Translation(
-                (-length / 2, -(d, w)[side % 2] / 2 - t, 0)
-            )
+            corner = Matrix.Translation((-length / 2, -(d, w)[side % 2] / 2 - t, 0))
+            spin = Matrix.Rotation(side * math.pi / 2, 4, "Z") @ corner
             material = shared if chance(rng, 0.6) else mat.paint(rng, 0.3, 1.5, light)
-            self.place(blender_mesh(geo.wall(length, h, t, holes[side])), material, spin)
+            self.place(geo.wall(length, h, t, holes[side]), material, spin)
             for x0, z0, x1, z1 in holes[side]:
                 self.openings.append((spin @ Matrix.Translation((x0, 0, z0)), x1 - x0, z1 - z0))
                 self._dress(spin @ Matrix.Translation((x0, t / 2, z0)), x1 - x0, z1 - z0, frame)
@@ -409,18 +433,17 @@ class Stage:
             tilt = geo.rotation((1, 0, 0), rng.uniform(-1.2, 1.2))
             slat = geo.box((0, -0.022, -0.001), (w, 0.022, 0.001)).rotated(tilt)
             slats = geo.merge([slat.moved(0, 0, z) for z in np.arange(0.02, h, 0.045)])
-            self.place(blender_mesh(slats), material, spin)
+            self.place(slats, material, spin)
         elif kind < 0.5:
-            self.place(blender_mesh(geo.bars(w, h, int(rng.integers(1, 6)), 0.025, False)), material, spin)
+            self.place(geo.bars(w, h, int(rng.integers(1, 6)), 0.025, False), material, spin)
         elif kind < 0.65:
-            x, z = np.meshgrid(
-                np.linspace(-0.1, w * rng.uniform(0.5, 1.1), 80), np.linspace(-0.1, h + 0.1, 12), indexing="ij"
-            )
+            along = np.linspace(-0.1, w * rng.uniform(0.5, 1.1), 80)
+            x, z = np.meshgrid(along, np.linspace(-0.1, h + 0.1, 12), indexing="ij")
             y = 0.14 + 0.035 * np.sin(x * rng.uniform(20, 60) + 0.4 * np.sin(z * 3))
-            self.place(blender_mesh(geo.surface(np.stack([x, y, z], -1), np.stack([x, z], -1))), mat.shade(rng), spin)
+            self.place(geo.surface(np.stack([x, y, z], -1), np.stack([x, z], -1)), mat.shade(rng), spin)
         if chance(rng, 0.35):
             glass = geo.quads(np.array([[[0, 0, 0], [w, 0, 0], [w, 0, h], [0, 0, h]]], float))
-            self.place(blender_mesh(glass), mat.pane(rng), spin)
+            self.place(glass, mat.pane(rng), spin)
 
     def portals(self) -> None:
         """Tell Cycles where the sky is seen from inside, as users do."""
@@ -488,7 +511,7 @@ class Stage:
         length, depth = ((high - low)[0], (high - low)[1]) if side % 2 == 0 else ((high - low)[1], (high - low)[0])
         at = Matrix.Translation((rng.uniform(-0.38, 0.38) * length, -depth / 2, rng.uniform(0.9, high[2] - 0.6)))
         spin = Matrix.Rotation(side * math.pi / 2, 4, "Z") @ at
-        self.place(blender_mesh(geo.box((-a / 2 - 0.03, 0, -b / 2 - 0.03), (a / 2 + 0.03, 0.025, b / 2 + 0.03))),
+        self.place(geo.box((-a / 2 - 0.03, 0, -b / 2 - 0.03), (a / 2 + 0.03, 0.025, b / 2 + 0.03)),
                    mat.thing(rng, 0.3, 0.4, 0.0), spin)  # fmt: skip
         face = geo.quads(np.array([[[-a, 0.028, -b], [-a, 0.028, b], [a, 0.028, b], [a, 0.028, -b]]]) / (2, 1, 2),
                          np.array([[[0, 0], [0, 1], [1, 1], [1, 0]]], float))  # fmt: skip
@@ -499,7 +522,7 @@ class Stage:
             material = mat.screen(rng, log_uniform(rng, 0.3, 5))
         else:
             material = mat.picture(tex.pattern(rng, 0.0), rng)
-        self.place(blender_mesh(face), material, spin)
+        self.place(face, material, spin)
         self.focus.append(np.array(spin.translation))
 
     # -- lamps of rooms ----------------------------------------------------------------------------
@@ -508,9 +531,8 @@ class Stage:
         """Add a tiny bright ball, seen or unseen."""
         rng, at = self.rng, self.spot(0.3, 0.95)
         if chance(rng, 0.4):
-            self.lamp(
-                "POINT", at, log_uniform(rng, 20, 120), self.tint(), shadow_soft_size=log_uniform(rng, 0.002, 0.06)
-            )
+            power = log_uniform(rng, 20, 120)
+            self.lamp("POINT", at, power, self.tint(), shadow_soft_size=log_uniform(rng, 0.002, 0.06))
         else:
             self.emitter(geo.sphere(log_uniform(rng, 0.008, 0.06), 16), log_uniform(rng, 5, 40), self.tint(), at)
 
@@ -523,9 +545,8 @@ class Stage:
         body = geo.lathe(np.stack([r * (1 - rng.uniform(0, 0.7) * z / h), z], 1))
         kind = rng.random()
         self.add(body, mat.shade(rng) if kind < 0.5 else mat.metal(rng) if kind < 0.65 else mat.paint(rng, 0.7, 5), at)
-        self.emitter(
-            geo.sphere(log_uniform(rng, 0.012, 0.05), 16), log_uniform(rng, 8, 40), self.tint(0.1), at + (0, 0, h * 0.5)
-        )
+        ball = geo.sphere(log_uniform(rng, 0.012, 0.05), 16)
+        self.emitter(ball, log_uniform(rng, 8, 40), self.tint(0.1), at + (0, 0, h * 0.5))
         low, high = (at[2] + h, self.corners[1][2]) if hanging else (0.0, at[2] + h * 0.3)
         self.add(geo.cylinder(0.006, high - low, 12), mat.metal(rng), (at[0], at[1], low))
         self.focus.append(at)
@@ -545,7 +566,7 @@ class Stage:
                   shape="RECTANGLE", size=size, size_y=rng.uniform(0.03, 0.3))  # fmt: skip
         back = geo.box((-size / 2, -0.16, -0.02), (size / 2, 0.16, -0.005))
         turn = Vector(target - at).to_track_quat("Z", "Y").to_matrix().to_4x4()
-        self.place(blender_mesh(back), mat.paint(rng, 0.8), Matrix.Translation(Vector(at)) @ turn)
+        self.place(back, mat.paint(rng, 0.8), Matrix.Translation(Vector(at)) @ turn)
 
     def behind(self) -> None:
         """Add a light behind a partition."""
@@ -554,9 +575,8 @@ class Stage:
         screen = geo.box((-0.9, -0.03, 0), (0.9, 0.03, rng.uniform(0.5, 0.95) * self.corners[1][2])).turned(angle)
         self.add(screen, mat.paint(rng, 0.4, 2), at)
         offset = geo.rotation((0, 0, 1), angle) @ np.array([rng.uniform(-0.6, 0.6), 0.3, rng.uniform(0.2, 1.8)])
-        self.lamp(
-            "POINT", at + offset, log_uniform(rng, 30, 150), self.tint(), shadow_soft_size=log_uniform(rng, 0.01, 0.1)
-        )
+        power = log_uniform(rng, 30, 150)
+        self.lamp("POINT", at + offset, power, self.tint(), shadow_soft_size=log_uniform(rng, 0.01, 0.1))
 
     def beam(self) -> None:
         rng = self.rng

@@ -8,18 +8,15 @@ from pathlib import Path
 
 from research.datagen import command_line
 
-from . import start
+from . import VARIANT, start
 
 
 def main() -> int:
-    """Run the command line and return the exit code."""
     parser = command_line.parser("research.datagen.mitsuba", "Render training views with Mitsuba 3.", ref_spp=96)
-    parser.add_argument(
-        "--assets", type=Path, help="folder with hdri/ and models/; without it all content is procedural"
-    )
-    parser.add_argument("--variant", default=start.VARIANT, help="of Mitsuba (default: %(default)s)")
+    parser.add_argument("--assets", type=Path, help=command_line.ASSETS)
+    parser.add_argument("--variant", default=VARIANT, help="of Mitsuba (default: %(default)s)")
     args = parser.parse_args()
-    start.start(args.threads, args.variant)
+    start(args.threads, args.variant)
     # These modules name Mitsuba's types, which exist only after a variant is set.
     from .assets import Assets
     from .render import render_scene

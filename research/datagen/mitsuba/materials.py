@@ -47,13 +47,6 @@ def varnished(image: np.ndarray) -> Bsdf:
     return _both_sides({"type": "plastic", "diffuse_reflectance": bitmap(image)})
 
 
-def rough_metal(name: str, alpha: np.ndarray, tint: np.ndarray) -> Bsdf:
-    return _both_sides({
-        "type": "roughconductor", "material": name, "distribution": "ggx",
-        "alpha": bitmap(alpha), "specular_reflectance": bitmap(tint),
-    })  # fmt: skip
-
-
 def mirror(tint: np.ndarray) -> Bsdf:
     return _both_sides({"type": "conductor", "material": "none", "specular_reflectance": bitmap(tint)})
 
@@ -64,10 +57,6 @@ def glass(ior: float = 1.5) -> Bsdf:
 
 def pane() -> Bsdf:
     return {"type": "thindielectric"}
-
-
-def frosted(alpha: float) -> Bsdf:
-    return {"type": "roughdielectric", "distribution": "ggx", "alpha": alpha}
 
 
 def structure(rng: Rng, image: np.ndarray | None = None) -> Bsdf:
@@ -91,12 +80,15 @@ def metal(rng: Rng) -> Bsdf:
     alpha = np.full((2, 2), 10 ** rng.uniform(-2, -0.35))
     if rng.random() < 0.4:
         alpha = np.clip(textures.fractal(rng, rng.uniform(0.4, 1.5)) * alpha[0, 0] * 2, 0.01, 0.7)
-    return rough_metal(name, alpha, tint)
+    rough = {"type": "roughconductor", "material": name, "distribution": "ggx", "alpha": bitmap(alpha)}
+    return _both_sides(rough | {"specular_reflectance": bitmap(tint)})
 
 
 def clear(rng: Rng) -> Bsdf:
     """Glass for closed meshes."""
-    return glass(rng.uniform(1.3, 1.7)) if rng.random() < 0.7 else frosted(10 ** rng.uniform(-1.7, -0.5))
+    if rng.random() < 0.7:
+        return glass(rng.uniform(1.3, 1.7))
+    return {"type": "roughdielectric", "distribution": "ggx", "alpha": 10 ** rng.uniform(-1.7, -0.5)}
 
 
 def thing(rng: Rng, image: np.ndarray | None = None, shiny: float = 0.25, clear_share: float = 0.08) -> Bsdf:

@@ -25,7 +25,7 @@ import numpy as np
 
 from oiio_msspl.image.filters import box_downsample
 from research.datagen import command_line, quality, samples, views
-from research.datagen.mitsuba.start import VARIANT, start
+from research.datagen.mitsuba import VARIANT, start
 
 if TYPE_CHECKING:  # Mitsuba's types exist only after a variant is set
     import mitsuba as mi
@@ -98,9 +98,10 @@ def render_view(
 
     hr = drawn(samples.HR_SAMPLES, base[1], LAYERS)
     lr = drawn(samples.LR_SAMPLES, base[2], LAYERS[:3])
+    stored_split = "train" if split == "room" else split
     meta = {
         "seed": f"{plan.kind}-{seed}" if split == "room" else seed, "view": view,
-        "split": _stored_split(split, ref_spp), "generator": VERSION, "kind": plan.kind,
+        "split": stored_split if ref_spp else views.NO_REFERENCE, "generator": VERSION, "kind": plan.kind,
         "renderer": f"Mitsuba {mi.__version__}, variant {mi.variant()}, own path tracer, {MAX_DEPTH} bounces",
         "sampler": "independent", "ref_spp": ref_spp, "ref_psnr": psnr,
         "ref_denoised": ref_spp > 0 and split != "test" and not keep_noise,
@@ -113,13 +114,6 @@ def render_view(
         layers = {name: images[name] for name in ("albedo", "normal")}
         return samples.pack(hr, lr, images["color"], rng, meta, layers)
     return samples.pack(hr, lr, images["color"] if split == "test" else _denoised(images), rng, meta)
-
-
-def _stored_split(split: str, ref_spp: int) -> str:
-    """Return the split that a view's file names."""
-    if not ref_spp:
-        return views.NO_REFERENCE
-    return "train" if split == "room" else split
 
 
 def render_scene(args: argparse.Namespace, assets: Assets, seed: int) -> tuple[int, str]:
@@ -152,19 +146,14 @@ def render_scene(args: argparse.Namespace, assets: Assets, seed: int) -> tuple[i
 
 
 def main() -> int:
-    """Run the command line and return the exit code."""
-    parser = command_line.parser(
-        "research.datagen.mitsuba.render_samples", "Render training views that keep their samples.", ref_spp=48
-    )
-    parser.add_argument(
-        "--assets", type=Path, help="folder with hdri/ and models/; without it all content is procedural"
-    )
+    module, description = "research.datagen.mitsuba.render_samples", "Render training views that keep their samples."
+    parser = command_line.parser(module, description, ref_spp=48)
+    parser.add_argument("--assets", type=Path, help=command_line.ASSETS)
     parser.add_argument("--rooms", type=Path, help="folder with bathroom2/ and living-room-3/, Mitsuba scenes")
     parser.add_argument("--kind", help="of scenes, only those of this one, such as ajar_room")
     parser.add_argument("--max-gib", type=float, default=6.0, help="start no new scene above this size (%(default)s)")
-    parser.add_argument(
-        "--keep-noise", action="store_true", help="references as rendered, for research.training.pool to denoise"
-    )
+    keep = "references as rendered, for research.training.pool to denoise"
+    parser.add_argument("--keep-noise", action="store_true", help=keep)
     parser.add_argument("--variant", default=VARIANT, help="of Mitsuba; cuda_ad_rgb for a GPU (%(default)s)")
     args = parser.parse_args()
     start(args.threads, args.variant)

@@ -54,9 +54,8 @@ class Scene:
         props["bsdf"] = mi.load_dict(bsdf)
         if radiance is not None:
             rgb = [float(c) for c in radiance]
-            props["emitter"] = mi.load_dict(
-                {"type": "area", "radiance": {"type": "rgb", "value": rgb}, "sampling_weight": weight}
-            )
+            light = {"type": "area", "radiance": {"type": "rgb", "value": rgb}, "sampling_weight": weight}
+            props["emitter"] = mi.load_dict(light)
         name = f"mesh{len(self._parts)}"
         n = mesh.n
         shape = mi.Mesh(
@@ -87,8 +86,7 @@ class Scene:
             self.sources.add(f"hdri/{name} (CC0, Poly Haven)")
         else:
             image = tex.sky(rng)
-        t = mi.ScalarTransform4f
-        to_world = t().rotate([0, 0, 1], float(rng.uniform(0, 360))).rotate([1, 0, 0], 90)
+        to_world = mi.ScalarTransform4f().rotate([0, 0, 1], float(rng.uniform(0, 360))).rotate([1, 0, 0], 90)
         self._parts["environment"] = mi.load_dict({
             "type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(image, np.float32)), "scale": scale,
             "to_world": to_world,
@@ -305,11 +303,10 @@ class Scene:
                     if side in (0, 3, 4):  # walls whose y = 0 is the outer face
                         corners = [[x, -0.1, z] for x, _, z in corners[::-1]]
                     self.light(place(geo.quads(np.array([corners])), side), self.tinted_light(daylight, 0.1))
-        floor = geo.box((-w / 2 - t, -d / 2 - t, -0.2), (w / 2 + t, d / 2 + t, 0))
-        self.add(
-            floor.tiled(rng.choice([0.4, 0.7, 1.2, 2.0])),
-            mat.structure(rng, tex.pattern(rng, 0.12) ** rng.choice([0.6, 1.0])),
+        floor = geo.box((-w / 2 - t, -d / 2 - t, -0.2), (w / 2 + t, d / 2 + t, 0)).tiled(
+            rng.choice([0.4, 0.7, 1.2, 2.0])
         )
+        self.add(floor, mat.structure(rng, tex.pattern(rng, 0.12) ** rng.choice([0.6, 1.0])))
 
     def _hole(self, side: int, length: float, height: float) -> tuple[float, float, float, float]:
         """Draw a window, a door gap or a skylight: its corners (x0, z0, x1, z1) in its wall."""

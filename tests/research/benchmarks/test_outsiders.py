@@ -126,7 +126,7 @@ def test_files_that_exist_are_not_rendered_again(tmp_path):
 
 def test_mitsuba_renders_light_groups_that_sum_to_the_beauty_and_vectors():
     mitsuba = pytest.importorskip("mitsuba")
-    from research.datagen.mitsuba.start import start
+    from research.datagen.mitsuba import start
 
     renderer = Renderer(start(1), (48, 32))
     assert mitsuba.variant()

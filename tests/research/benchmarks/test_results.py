@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch")
 
 from oiio_msspl._version import full_version
-from research.benchmarks import paper, results, tables, timer
+from research.benchmarks import results, tables, timer
 
 STAMPED = {"version": "1", "machine": "m", "date": "2026-01-02"}
 
@@ -134,10 +134,10 @@ def test_a_finding_that_the_measures_dispute_is_no_agreement():
     def rows(*pairs):
         return [{"psnr": psnr, "relmse": relmse} for psnr, relmse in pairs]
 
-    assert paper.verdict(rows((1, 0.5), (2, 0.4))) == "agrees"
-    assert paper.verdict(rows((1, 0.5), (2, 0.6))) == "PSNR and RelMSE disagree"
-    assert paper.verdict(rows((2, 0.5), (1, 0.6))) == "**differs**"
-    assert "| PSNR and RelMSE disagree |" in paper.findings()
+    assert tables.verdict(rows((1, 0.5), (2, 0.4))) == "agrees"
+    assert tables.verdict(rows((1, 0.5), (2, 0.6))) == "PSNR and RelMSE disagree"
+    assert tables.verdict(rows((2, 0.5), (1, 0.6))) == "**differs**"
+    assert "| PSNR and RelMSE disagree |" in tables.findings()
 
 
 def job(log, name):

@@ -5,8 +5,11 @@ import hashlib
 import struct
 
 import numpy as np
+import pytest
 
-from research.training.oidn_weights import NETWORKS, read_weights
+pytest.importorskip("torch")
+
+from research.training.oidn import NETWORKS, read_weights
 
 
 def tza(**tensors):

@@ -19,32 +19,43 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from oiio_msspl._version import __version__
+from oiio_msspl._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from oiio_msspl.aovs.mapped_render import MappedRender
-    from oiio_msspl.aovs.matching import map_render
-    from oiio_msspl.errors import InputError, MssplError
-    from oiio_msspl.exr.reader import open_exr
-    from oiio_msspl.exr.render import Render, Window
-    from oiio_msspl.exr.write_options import WriteOptions
-    from oiio_msspl.findings import Finding
-    from oiio_msspl.fusion.fuse import FusedFrame, fuse
-    from oiio_msspl.inspection import Inspection, inspect_file
-    from oiio_msspl.jobs.arrays import fuse_arrays
-    from oiio_msspl.jobs.farm.openjd import Job, make_job, write_bundle
-    from oiio_msspl.jobs.files import fuse_files
-    from oiio_msspl.jobs.inputs import InputOptions
-    from oiio_msspl.jobs.pair_check import PairCheck, check_files
-    from oiio_msspl.jobs.plan import TemporalOptions
-    from oiio_msspl.jobs.report import FrameReport
-    from oiio_msspl.jobs.sequence import Shot, find_shot
-    from oiio_msspl.jobs.shot import fuse_shot
-    from oiio_msspl.jobs.shot_check import ShotCheck, check_shot
-    from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
-    from oiio_msspl.model.catalogue import find_model, shipped_models
-    from oiio_msspl.model.contract import Contract
-    from oiio_msspl.model.session import Session
+    from oiio_msspl.aovs.mapped_render import MappedRender as MappedRender
+    from oiio_msspl.aovs.matching import map_render as map_render
+    from oiio_msspl.errors import InputError as InputError
+    from oiio_msspl.errors import MssplError as MssplError
+    from oiio_msspl.exr.reader import open_exr as open_exr
+    from oiio_msspl.exr.render import Render as Render
+    from oiio_msspl.exr.render import Window as Window
+    from oiio_msspl.exr.write_options import WriteOptions as WriteOptions
+    from oiio_msspl.findings import Finding as Finding
+    from oiio_msspl.fusion.fuse import FusedFrame as FusedFrame
+    from oiio_msspl.fusion.fuse import fuse as fuse
+    from oiio_msspl.inspection import Inspection as Inspection
+    from oiio_msspl.inspection import inspect_file as inspect_file
+    from oiio_msspl.jobs.arrays import fuse_arrays as fuse_arrays
+    from oiio_msspl.jobs.farm.openjd import Job as Job
+    from oiio_msspl.jobs.farm.openjd import make_job as make_job
+    from oiio_msspl.jobs.farm.openjd import write_bundle as write_bundle
+    from oiio_msspl.jobs.files import fuse_files as fuse_files
+    from oiio_msspl.jobs.inputs import InputOptions as InputOptions
+    from oiio_msspl.jobs.pair_check import PairCheck as PairCheck
+    from oiio_msspl.jobs.pair_check import check_files as check_files
+    from oiio_msspl.jobs.plan import TemporalOptions as TemporalOptions
+    from oiio_msspl.jobs.report import FrameReport as FrameReport
+    from oiio_msspl.jobs.sequence import Shot as Shot
+    from oiio_msspl.jobs.sequence import find_shot as find_shot
+    from oiio_msspl.jobs.shot import fuse_shot as fuse_shot
+    from oiio_msspl.jobs.shot_check import ShotCheck as ShotCheck
+    from oiio_msspl.jobs.shot_check import check_shot as check_shot
+    from oiio_msspl.jobs.shot_report import FrameResult as FrameResult
+    from oiio_msspl.jobs.shot_report import ShotReport as ShotReport
+    from oiio_msspl.model.catalogue import find_model as find_model
+    from oiio_msspl.model.catalogue import shipped_models as shipped_models
+    from oiio_msspl.model.contract import Contract as Contract
+    from oiio_msspl.model.session import Session as Session
 
 _MODULES = {
     "Contract": "model.contract",
@@ -83,43 +94,7 @@ _MODULES = {
     "write_bundle": "jobs.farm.openjd",
 }
 
-__all__ = [
-    "Contract",
-    "Finding",
-    "FrameReport",
-    "FrameResult",
-    "FusedFrame",
-    "InputError",
-    "InputOptions",
-    "Inspection",
-    "Job",
-    "MappedRender",
-    "MssplError",
-    "PairCheck",
-    "Render",
-    "Session",
-    "Shot",
-    "ShotCheck",
-    "ShotReport",
-    "TemporalOptions",
-    "Window",
-    "WriteOptions",
-    "__version__",
-    "check_files",
-    "check_shot",
-    "find_model",
-    "find_shot",
-    "fuse",
-    "fuse_arrays",
-    "fuse_files",
-    "fuse_shot",
-    "inspect_file",
-    "make_job",
-    "map_render",
-    "open_exr",
-    "shipped_models",
-    "write_bundle",
-]
+__all__ = [*_MODULES, "__version__"]
 
 
 def __getattr__(name: str) -> Any:

@@ -65,12 +65,10 @@ def _names_in(entry: object) -> Iterator[str]:
     """Yield the names and patterns of layers in a candidate, or in a list of candidates."""
     if isinstance(entry, str):
         yield entry
-    elif isinstance(entry, list):
-        for element in entry:
+    elif isinstance(entry, Mapping | list):
+        keys = ("layer", "layers", "sum", "times", "halves")
+        for element in [entry.get(key, []) for key in keys] if isinstance(entry, Mapping) else entry:
             yield from _names_in(element)
-    elif isinstance(entry, Mapping):
-        for key in ("layer", "layers", "sum", "times", "halves"):
-            yield from _names_in(entry.get(key, []))
 
 
 def entry_of(candidate: str | Mapping[str, Any]) -> Mapping[str, Any]:
@@ -163,7 +161,7 @@ def _holds_by_name(rule: dict[str, Any], path: Path) -> bool:
 
 def siblings_of(path: Path, aov: str) -> list[Path]:
     """Return the possible files of an AOV beside the beauty ``path``; the one named after the beauty comes first."""
-    return [path.with_name(f"{stem}.exr") for stem in (f"{path.stem}.{aov}", aov)]
+    return [path.with_name(f"{path.stem}.{aov}.exr"), path.with_name(f"{aov}.exr")]
 
 
 def sibling_of(path: Path, aov: str) -> Path | None:
@@ -192,19 +190,12 @@ def _with_word(name: str, aov: str) -> list[str]:
 
 def aov_files(path: Path) -> set[Path]:
     """Find the files of AOVs beside the beauty ``path`` by names, without opening the beauty."""
-    names: set[str] = set()
-    for renderer in renderers():
-        aovs = set(file_names(renderer))
-        if aovs and any(_holds_by_name(rule, path) for rule in renderer["detect"]):
-            names |= aovs
-    beside = {file for feature in (ALBEDO, NORMAL) for aov in _aovs_beside(feature) if (file := file_beside(path, aov))}
-    return beside | {file for name in names if (file := sibling_of(path, name))}
-
-
-def _aovs_beside(feature: str) -> list[str]:
-    """Return the AOVs of :func:`file_beside` that a feature may be read from."""
-    names = (entry_of(candidate).get("layer", "") for candidate in renderers()[-1][feature])
-    return [name.removeprefix("beside:") for name in names if name.startswith("beside:")]
+    by_name = [entry for entry in renderers() if any(_holds_by_name(rule, path) for rule in entry["detect"])]
+    siblings = {sibling_of(path, name) for name in file_names(by_name)}
+    common = renderers()[-1]
+    layers = [entry_of(candidate).get("layer", "") for candidate in [*common[ALBEDO], *common[NORMAL]]]
+    beside = {file_beside(path, name.removeprefix("beside:")) for name in layers if name.startswith("beside:")}
+    return {file for file in siblings | beside if file}
 
 
 def file_names(entry: object) -> Iterator[str]:

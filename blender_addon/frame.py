@@ -144,12 +144,10 @@ def loaded_once(scene: Scene) -> Iterator[None]:
 def _input_renders(scene: Scene, options: Options, work: Path) -> list[tuple[InputRender, dict[str, Any]]]:
     """Return the renders that are fused, each with its settings."""
     names = ["LRHS", "HRLS"] if options.scale > 1 else ["render 1", "render 2"] if options.renders > 1 else ["render"]
+    low = InputRender(names[0], lrhs_size(scene, options.scale), options.lrhs_spp, str(work / "lr.exr"))
     full = InputRender(names[-1], hrls_size(scene), options.hrls_spp, str(work / "hr.exr"))
-    inputs = [(full, render_settings.hrls(scene, options))]
-    if options.renders > 1:
-        first = InputRender(names[0], lrhs_size(scene, options.scale), options.lrhs_spp, str(work / "lr.exr"))
-        inputs.insert(0, (first, render_settings.lrhs(scene, options)))
-    return inputs
+    inputs = [(low, render_settings.lrhs(scene, options)), (full, render_settings.hrls(scene, options))]
+    return inputs[-options.renders :]
 
 
 def run_to_end(job: Generator[Progress, None, Report], on_step: Callable[[str, float], None]) -> Report:

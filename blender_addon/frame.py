@@ -89,16 +89,12 @@ def render_and_fuse(
     overwrite: bool = False,
     window: bool = False,
 ) -> Generator[Progress, None, Report]:
-    """Render and fuse a frame, and yield the progress.
+    """Render and fuse a frame, yield the progress, and return a :class:`Report`.
 
     Args:
-        output: the EXR to write.
         work: a folder for the renders, which stay there.
         loaded: entered while frames are rendered: :func:`loaded_once`, or nothing if the caller is inside of it.
         window: let Blender go on while it renders. The caller must then return to Blender's event loop between steps.
-
-    Returns:
-        A :class:`Report`.
 
     Raises:
         Failure, Cancelled: no output was written.

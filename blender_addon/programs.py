@@ -59,16 +59,12 @@ def find_render(preference: str = "") -> str:
 def fuse(
     program: str, options: Sequence[str], work: Path, renders: Sequence[str], before: float, output: str
 ) -> Generator[Progress, None, dict[str, Any]]:
-    """Fuse one render or two.
+    """Fuse one render or two, and return the report of msspl-fuse.
 
     Args:
         program: of :func:`find_fuse`.
-        options: of msspl-fuse.
         work: a folder for temporary files.
         before: the progress before it.
-
-    Returns:
-        The report of msspl-fuse.
 
     Raises:
         Failure: msspl-fuse failed. The message is its own.

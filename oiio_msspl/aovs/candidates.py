@@ -47,7 +47,6 @@ class LayerFinder:
         """Return the formula that a candidate describes; None if a layer is missing or has the wrong channels.
 
         Args:
-            feature: the feature that is wanted.
             candidate: checked by :func:`oiio_msspl.aovs.mapping.check_mapping`.
             problems: a sentence is added for a layer that exists but has the wrong channels.
 
@@ -66,7 +65,8 @@ class LayerFinder:
             if (group := self._group(feature, alias, problems)) is None:
                 return None
             found.append(group)
-        *groups, factor = [channels for channels, _ in found] + ([] if "times" in entry else [None])
+        groups = [channels for channels, _ in found]
+        factor = groups.pop() if "times" in entry else None
         kind = "halves" if "halves" in entry else entry.get("kind", "mean")
         encoding, note = entry.get("encoding", "signed"), entry.get("note", "")
         text = _text([name for _, name in found], factor is not None)

@@ -166,11 +166,10 @@ def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionF
     """Find the motion vectors that the user's ``--motion-format`` describes.
 
     Args:
-        layers: of the file.
+        layers: those of the file ``path``.
         text: ``layer=NAME`` and any of ``channels=XY``, ``to=``, ``x=``, ``y=``, ``unit=``, ``scale=``, ``offset=`` and
             ``premultiplied``, separated by commas. Further layers follow behind ``+``. The pixels decide words that are
             left out.
-        path: of the file, for messages.
 
     Raises:
         InputError: the text can't be read, or the file has no such layer.
@@ -249,8 +248,9 @@ def _vectors_in(
     named: tuple[str, Layer] | None, components: Sequence[str] | None = None, form: MotionFormat | None = None
 ) -> list[MotionField]:
     """Return the vectors of a layer, if there is one, in these channels or in the first usual ones: one or none."""
+    name, layer = named or ("", Layer("", ""))
     for pair in [tuple(components)] if components else _PAIRS:
-        channels = [named[1].channels[c] for c in pair if c in named[1].channels] if named else []
+        channels = [layer.channels[c] for c in pair if c in layer.channels]
         if len(channels) == 2 and all(c.type != "uint" for c in channels) and channels[0].part == channels[1].part:
-            return [MotionField(named[0], (pair[0], pair[1]), (channels[0], channels[1]), form or MotionFormat())]
+            return [MotionField(name, (pair[0], pair[1]), (channels[0], channels[1]), form or MotionFormat())]
     return []

@@ -174,7 +174,6 @@ class ExrFile:
         """Yield all rows of neighbouring channels in their stored pixel type, to be copied bit for bit.
 
         Args:
-            part: the part that holds the channels.
             first, last: indices of the first channel and of the one after the last. All have one pixel type.
             later: more such ranges, which later calls read inside of one :meth:`cache_strips`. Those of this pixel type
                 are decoded together with this range and kept until they are read; those that do not fit into the

@@ -153,28 +153,6 @@ def _prepare(node: nuke.Node, frame: int | None, on_farm: bool) -> _Job:
     out = name_output(_path(node, "output"), _find_file(hr_read, frames, views[0]), frames[0])
     if views[0] and "%v" not in out.pattern.lower():
         raise FuseError(f"output {out.path}: has no %V or %v, so the views would replace each other")
-    return _Job(
-        node=node,
-        name=name,
-        colour_knobs={knob: hr_read[knob].toScript() for knob in ("raw", "colorspace")},
-        commands=_commands(node, reads, out, views, frames, frame is None, on_farm),
-        environment=clean_environment(os.environ, os.path.dirname(nuke.EXE_PATH)),
-        out=out,
-        offset=0 if out.number is None else out.number - frames[0],
-        on_farm=on_farm,
-    )
-
-
-def _commands(
-    node: nuke.Node,
-    reads: list[nuke.Node],
-    out: FrameFile,
-    views: list[str],
-    frames: range,
-    as_range: bool,
-    on_farm: bool,
-) -> list[list[str]]:
-    """Build the command lines of each view."""
     program = find_program(_path(node, "program"), os.environ)
     submit = split_words("submit with", _text(node, "submit"))
     knobs: dict[str, Any] = {knob: _text(node, knob) for knob in _KNOBS}
@@ -182,13 +160,22 @@ def _commands(
     commands = []
     for view in views:
         ends = [ReadRange(r.name(), _find_file(r, frames, view), _find_file(r, frames[::-1], view)) for r in reads]
-        numbers = file_numbers(ends, out, frames[0], frames[-1]) if as_range else None
+        numbers = file_numbers(ends, out, frames[0], frames[-1]) if frame is None else None
         bundle = os.path.join(tempfile.mkdtemp(prefix="msspl-"), "job") if on_farm else ""
         files = [file.in_view(view) for file in (*(end.first for end in ends), out)]
         commands.append(build_command(program, files, settings, numbers, bundle))
         if bundle and submit:
             commands.append([*submit, bundle])
-    return commands
+    return _Job(
+        node=node,
+        name=name,
+        colour_knobs={knob: hr_read[knob].toScript() for knob in ("raw", "colorspace")},
+        commands=commands,
+        environment=clean_environment(os.environ, os.path.dirname(nuke.EXE_PATH)),
+        out=out,
+        offset=0 if out.number is None else out.number - frames[0],
+        on_farm=on_farm,
+    )
 
 
 def _find_read(node: nuke.Node, index: int, label: str) -> nuke.Node | None:

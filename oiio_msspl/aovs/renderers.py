@@ -8,6 +8,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
@@ -100,22 +101,16 @@ def names_of_aov(renderer: Mapping[str, Any], file: ExrFile, aov: str) -> list[s
     Several layers hold one AOV if lights are split into groups: none of the layers is the whole AOV.
     """
     if (number := renderer.get("types", {}).get(aov)) is not None:
-        return [*_layers_of_type(renderer, file, number), aov]
+        typed: list[str] = []
+        with suppress(ValueError, AttributeError, RecursionError):  # no such attribute, or other contents
+            elements = json.loads(str(file.metadata.get(renderer["types"]["attribute"])))
+            typed = [name for name, element in elements.items() if element.get("alias") == number]
+        return [*typed, aov] if len(typed) == 1 else [aov]
     if "source" not in renderer:
         return [aov]
     named = (key for key, value in file.metadata.items() if same_spelling(str(value)) == same_spelling(aov))
     layers = {match[1] for key in named if (match := re.search(renderer["source"], key))}
     return [aov, *layers] if len(layers) == 1 else [aov]
-
-
-def _layers_of_type(renderer: Mapping[str, Any], file: ExrFile, number: int) -> list[str]:
-    """Return the layer that has a type by the header's JSON; none if none or several have."""
-    try:
-        elements = json.loads(str(file.metadata.get(renderer["types"]["attribute"])))
-        layers = [name for name, element in elements.items() if element.get("alias") == number]
-    except (ValueError, AttributeError, RecursionError):  # no such attribute, or other contents
-        return []
-    return layers if len(layers) == 1 else []
 
 
 def view_layer_of(layer: str, alias: str) -> str | None:

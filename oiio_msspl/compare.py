@@ -92,11 +92,10 @@ def open_comparison(images: Sequence[Path], reference: Path | None = None, layer
     mapping = {RGB: layer} if layer else {}
     renders: list[MappedRender] = []
     for path in [*images, *([reference] if reference else [])]:
-        file = open_exr(path)
-        render = map_render(file, mapping, features=())
+        render = map_render(open_exr(path), mapping, features=())
         view = renders[0].view if renders else ""
         if view != render.view and any(view in (label, *label.split("/")) for label in render.other_views):
-            render = map_render(file, mapping, view=view, features=())
+            render = map_render(render.file, mapping, view=view, features=())
         renders.append(render)
     sizes = [render.data_window.width * render.data_window.height for render in renders]
     largest = len(renders) - 1 if reference else sizes.index(max(sizes))

@@ -181,10 +181,8 @@ def _groups(layer: Layer) -> Iterator[tuple[tuple[Channel, ...], str]]:
 
 def _chosen(pictures: Sequence[_Picture], patterns: Sequence[str]) -> list[str]:
     """Return the keys of the layers to show: the beauty, and those of the patterns, or else of additive sets."""
-    candidates: dict[str, list[_Layer]] = {}
-    for picture in pictures:
-        for key, layer in picture.layers.items():
-            candidates.setdefault(key, []).append(layer)
+    keys = dict.fromkeys(key for picture in pictures for key in picture.layers)
+    candidates = {key: [picture.layers[key] for picture in pictures if key in picture.layers] for key in keys}
     if not patterns:
         return [key for key, layers in candidates.items() if key == BEAUTY or any(layer.additive for layer in layers)]
     chosen = {BEAUTY}

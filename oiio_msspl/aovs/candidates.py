@@ -77,7 +77,9 @@ class LayerFinder:
     ) -> tuple[tuple[Channel, ...], str] | None:
         """Return the channels of a layer, or of a list of channel names, and their name for the user."""
         if isinstance(alias, list):
-            stored = self._channels()
+            # Of equal names, the chosen view's first one.
+            layers = sorted(self._layers, key=lambda layer: layer.view != self._view)
+            stored = {c.name: c for layer in reversed(layers) for c in reversed(layer.channels.values())}
             return (tuple(stored[c] for c in alias), " ".join(alias)) if all(c in stored for c in alias) else None
         layer = self._layer(feature, alias)
         if layer is None:
@@ -87,11 +89,6 @@ class LayerFinder:
             problems.append(wrong_channels(feature, layer))
             return None
         return group, layer.name or " ".join(channel.name for channel in group)
-
-    def _channels(self) -> dict[str, Channel]:
-        """Return channels by their stored names; of equal names, the chosen view's first one."""
-        layers = sorted(self._layers, key=lambda layer: layer.view != self._view)
-        return {c.name: c for layer in reversed(layers) for c in reversed(layer.channels.values())}
 
     def _formula_of_file(self, feature: str, path: Path) -> FeatureFormula:
         """Find the feature of another render by the table of renderers, or else take its only layer."""

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import nuke
+from msspl_bridge import FuseError
 from msspl_bridge.command import Settings, build_command, clean_environment, find_program, split_words
-from msspl_bridge.errors import FuseError
 from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output, parse_range
 from msspl_bridge.passes import ATTRIBUTE, FusedSet, fused_sets
 from msspl_bridge.process import Outcome, run

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from msspl_bridge.errors import FuseError
+from msspl_bridge import FuseError
 from msspl_bridge.frame_files import FrameFile, with_slashes
 
 #: Variables that the host sets for its own Python. Another Python may not start with them.

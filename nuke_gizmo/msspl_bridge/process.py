@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from msspl_bridge.errors import FuseError
+from msspl_bridge import FuseError
 
 #: The box that the command line draws around a mistake in the options.
 _BOX = " \u2502\n"

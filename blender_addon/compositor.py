@@ -20,7 +20,6 @@ def show(scene: Scene, view_layer: str, path: str, connect: bool, frames: Sequen
     the scene again for them when it composites.
 
     Args:
-        view_layer: the name of the view layer of the file.
         path: may begin with ``//``, which stands for the folder of the .blend.
         connect: connect the node to the compositor's output even if another node is connected there.
         frames: numbers of the frames of an animation, whose first file ``path`` is. None: it is a single frame.

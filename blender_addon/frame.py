@@ -89,16 +89,12 @@ def render_and_fuse(
     overwrite: bool = False,
     window: bool = False,
 ) -> Generator[Progress, None, Report]:
-    """Render and fuse a frame, and yield the progress.
+    """Render and fuse a frame, yield the progress, and return a :class:`Report`.
 
     Args:
-        output: the EXR to write.
         work: a folder for the renders, which stay there.
         loaded: entered while frames are rendered: :func:`loaded_once`, or nothing if the caller is inside of it.
         window: let Blender go on while it renders. The caller must then return to Blender's event loop between steps.
-
-    Returns:
-        A :class:`Report`.
 
     Raises:
         Failure, Cancelled: no output was written.
@@ -144,12 +140,10 @@ def loaded_once(scene: Scene) -> Iterator[None]:
 def _input_renders(scene: Scene, options: Options, work: Path) -> list[tuple[InputRender, dict[str, Any]]]:
     """Return the renders that are fused, each with its settings."""
     names = ["LRHS", "HRLS"] if options.scale > 1 else ["render 1", "render 2"] if options.renders > 1 else ["render"]
+    low = InputRender(names[0], lrhs_size(scene, options.scale), options.lrhs_spp, str(work / "lr.exr"))
     full = InputRender(names[-1], hrls_size(scene), options.hrls_spp, str(work / "hr.exr"))
-    inputs = [(full, render_settings.hrls(scene, options))]
-    if options.renders > 1:
-        first = InputRender(names[0], lrhs_size(scene, options.scale), options.lrhs_spp, str(work / "lr.exr"))
-        inputs.insert(0, (first, render_settings.lrhs(scene, options)))
-    return inputs
+    inputs = [(low, render_settings.lrhs(scene, options)), (full, render_settings.hrls(scene, options))]
+    return inputs[-options.renders :]
 
 
 def run_to_end(job: Generator[Progress, None, Report], on_step: Callable[[str, float], None]) -> Report:

@@ -157,10 +157,8 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
         # Without a window, Blender does not know whether a file has changed.
         if not file or (bpy.data.is_dirty and not bpy.app.background):
             raise Failure(f"{file or 'the scene'}: save the .blend first; another Blender renders the saved file")
-        pattern, frames = (
-            _output(scene, options.view_layer),
-            range(scene.frame_start, scene.frame_end + 1, scene.frame_step),
-        )
+        pattern = _output(scene, options.view_layer)
+        frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         if not _LAST_NUMBER.search(pattern):
             raise Failure(f"{pattern}: name the frames with #### as the last number, such as //fused_####.exr")
         outputs = {number: bpy.path.abspath(_numbered(pattern, number)) for number in frames}
@@ -220,12 +218,11 @@ def _preference(context: Context) -> str:
     return bpy.path.abspath(addon.preferences.program) if addon else ""
 
 
-_CLASSES = (MSSPL_OT_fuse, MSSPL_OT_fuse_animation)
+_register, _unregister = bpy.utils.register_classes_factory((MSSPL_OT_fuse, MSSPL_OT_fuse_animation))
 
 
 def register() -> None:
-    for added in _CLASSES:
-        bpy.utils.register_class(added)
+    _register()
     bpy.app.handlers.save_pre.append(overrides.restore_for_save)
     for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
         after.append(overrides.override_after_save)
@@ -235,5 +232,4 @@ def unregister() -> None:
     bpy.app.handlers.save_pre.remove(overrides.restore_for_save)
     for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
         after.remove(overrides.override_after_save)
-    for added in reversed(_CLASSES):
-        bpy.utils.unregister_class(added)
+    _unregister()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Draws the panel Render Properties > MSSPL Fuse, and holds its settings and the add-on's preferences."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
@@ -9,19 +9,8 @@ from bpy.types import Context
 
 from .options import Options, hrls_size, lrhs_size
 
-
-@dataclass
-class Status:
-    """The current step of the running job. The text is empty if no job runs.
-
-    A Blender property would be saved in the .blend.
-    """
-
-    text: str = ""
-    fraction: float = 0.0
-
-
-status = Status()
+#: The current step of the running job; without a text, no job runs. A Blender property would be saved in the .blend.
+status = SimpleNamespace(text="", fraction=0.0)
 
 
 class MSSPLSettings(bpy.types.PropertyGroup):
@@ -151,16 +140,14 @@ class MSSPL_PT_fuse(bpy.types.Panel):
             layout.operator("msspl.fuse_animation", icon="RENDER_ANIMATION")
 
 
-CLASSES = (MSSPLSettings, MSSPLPreferences, MSSPL_PT_fuse)
+_register, _unregister = bpy.utils.register_classes_factory((MSSPLSettings, MSSPLPreferences, MSSPL_PT_fuse))
 
 
 def register() -> None:
-    for added in CLASSES:
-        bpy.utils.register_class(added)
+    _register()
     bpy.types.Scene.msspl = PointerProperty(type=MSSPLSettings)
 
 
 def unregister() -> None:
     del bpy.types.Scene.msspl
-    for added in reversed(CLASSES):
-        bpy.utils.unregister_class(added)
+    _unregister()

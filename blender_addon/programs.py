@@ -59,24 +59,19 @@ def find_render(preference: str = "") -> str:
 def fuse(
     program: str, options: Sequence[str], work: Path, renders: Sequence[str], before: float, output: str
 ) -> Generator[Progress, None, dict[str, Any]]:
-    """Fuse one render or two.
+    """Fuse one render or two, and return the report of msspl-fuse.
 
     Args:
         program: of :func:`find_fuse`.
-        options: of msspl-fuse.
         work: a folder for temporary files.
         before: the progress before it.
-
-    Returns:
-        The report of msspl-fuse.
 
     Raises:
         Failure: msspl-fuse failed. The message is its own.
     """
     # Blender's Image node shows all passes of a single-part file only. The result names its renders, whose folder goes.
     names = [os.path.relpath(render, work) for render in renders]
-    command = [program, *names, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
-    command += options
+    command = [program, *names, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v", *options]
 
     def progress(log: Path) -> Progress:
         steps = _STEP.findall(_read(log))
@@ -105,14 +100,11 @@ def render_shot(
     overwrite, frames = scene.render.use_overwrite, f"{min(outputs)}-{max(outputs)}x{scene.frame_step}"
     command = [program, bpy.data.filepath, "-o", pattern, "--frames", frames, "--json"]
     command += ["--blender", bpy.app.binary_path or sys.executable]
-    command += ["--scene-name", scene.name, "--view-layer", options.view_layer]
+    command += ["--scene-name", scene.name, "--view-layer", options.view_layer, *model_options(scene)]
     command += ["--renders", str(options.renders), "--scale", str(options.scale), "--filter", options.filter.lower()]
-    command += ["--hr-spp", str(options.hrls_spp)]
+    command += ["--hr-spp", str(options.hrls_spp), "--temporal", "auto" if scene.msspl.average else "off"]
     command += ["--lr-spp", str(options.lr_spp)] if options.lr_spp and options.scale > 1 else []
-    command += ["--components"] if options.components else []
-    command += model_options(scene)
-    command += ["--temporal", "auto" if scene.msspl.average else "off"]
-    command += ["--overwrite" if overwrite else "--skip-existing"]
+    command += [*(["--components"] if options.components else []), "--overwrite" if overwrite else "--skip-existing"]
     files = list(outputs.values())
     before, done = [_written(path) if overwrite else None for path in files], 0
 

@@ -14,29 +14,15 @@ from .options import Options, find_view_layer, hrls_size, lrhs_size, view_layer_
 
 BLENDER_5 = bpy.app.version >= (5, 0, 0)
 
-#: The passes that the network reads besides Combined. Other passes stay as the user has set them.
-_PASSES = (
-    "use_pass_combined",
-    "use_pass_normal",
-    "use_pass_diffuse_direct",
-    "use_pass_diffuse_indirect",
-    "use_pass_diffuse_color",
-    "use_pass_glossy_direct",
-    "use_pass_glossy_indirect",
-    "use_pass_glossy_color",
-    "cycles.denoising_store_passes",
+#: The passes of light and colour of each kind of surface.
+_DIFFUSE, _GLOSSY, _TRANSMISSION = (
+    [f"use_pass_{kind}_{part}" for part in ("direct", "indirect", "color")]
+    for kind in ("diffuse", "glossy", "transmission")
 )
-#: The component passes: light times colour of each kind of surface, and the light that no surface reflects.
-_COMPONENTS = (
-    *(
-        f"use_pass_{kind}_{part}"
-        for kind in ("diffuse", "glossy", "transmission")
-        for part in ("direct", "indirect", "color")
-    ),
-    "use_pass_emit",
-    "cycles.use_pass_volume_direct",
-    "cycles.use_pass_volume_indirect",
-)
+#: The passes that the network reads. Other passes stay as the user has set them.
+_PASSES = ["use_pass_combined", "use_pass_normal", *_DIFFUSE, *_GLOSSY, "cycles.denoising_store_passes"]
+#: The passes that component passes add: the remaining surfaces, and the light that no surface reflects.
+_COMPONENTS = [*_TRANSMISSION, "use_pass_emit", "cycles.use_pass_volume_direct", "cycles.use_pass_volume_indirect"]
 #: Names of linear colour spaces: Linear Rec.2020, lin_ap1, scene_linear, ACEScg, ACES2065-1. Blender does not tell.
 _LINEAR = re.compile(r"(?<![a-z])lin(ear)?(?![a-z])|acescg|aces2065", re.IGNORECASE)
 #: Added to the scene's seed for the first of two renders. With one seed, both would share samples and their noise.

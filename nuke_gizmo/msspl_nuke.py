@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import nuke
+from msspl_bridge import FuseError
 from msspl_bridge.command import Settings, build_command, clean_environment, find_program, split_words
-from msspl_bridge.errors import FuseError
 from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output, parse_range
 from msspl_bridge.passes import ATTRIBUTE, FusedSet, fused_sets
 from msspl_bridge.process import Outcome, run
@@ -153,28 +153,6 @@ def _prepare(node: nuke.Node, frame: int | None, on_farm: bool) -> _Job:
     out = name_output(_path(node, "output"), _find_file(hr_read, frames, views[0]), frames[0])
     if views[0] and "%v" not in out.pattern.lower():
         raise FuseError(f"output {out.path}: has no %V or %v, so the views would replace each other")
-    return _Job(
-        node=node,
-        name=name,
-        colour_knobs={knob: hr_read[knob].toScript() for knob in ("raw", "colorspace")},
-        commands=_commands(node, reads, out, views, frames, frame is None, on_farm),
-        environment=clean_environment(os.environ, os.path.dirname(nuke.EXE_PATH)),
-        out=out,
-        offset=0 if out.number is None else out.number - frames[0],
-        on_farm=on_farm,
-    )
-
-
-def _commands(
-    node: nuke.Node,
-    reads: list[nuke.Node],
-    out: FrameFile,
-    views: list[str],
-    frames: range,
-    as_range: bool,
-    on_farm: bool,
-) -> list[list[str]]:
-    """Build the command lines of each view."""
     program = find_program(_path(node, "program"), os.environ)
     submit = split_words("submit with", _text(node, "submit"))
     knobs: dict[str, Any] = {knob: _text(node, knob) for knob in _KNOBS}
@@ -182,13 +160,22 @@ def _commands(
     commands = []
     for view in views:
         ends = [ReadRange(r.name(), _find_file(r, frames, view), _find_file(r, frames[::-1], view)) for r in reads]
-        numbers = file_numbers(ends, out, frames[0], frames[-1]) if as_range else None
+        numbers = file_numbers(ends, out, frames[0], frames[-1]) if frame is None else None
         bundle = os.path.join(tempfile.mkdtemp(prefix="msspl-"), "job") if on_farm else ""
         files = [file.in_view(view) for file in (*(end.first for end in ends), out)]
         commands.append(build_command(program, files, settings, numbers, bundle))
         if bundle and submit:
             commands.append([*submit, bundle])
-    return commands
+    return _Job(
+        node=node,
+        name=name,
+        colour_knobs={knob: hr_read[knob].toScript() for knob in ("raw", "colorspace")},
+        commands=commands,
+        environment=clean_environment(os.environ, os.path.dirname(nuke.EXE_PATH)),
+        out=out,
+        offset=0 if out.number is None else out.number - frames[0],
+        on_farm=on_farm,
+    )
 
 
 def _find_read(node: nuke.Node, index: int, label: str) -> nuke.Node | None:
@@ -206,8 +193,7 @@ def _find_read(node: nuke.Node, index: int, label: str) -> nuke.Node | None:
 
 def _range_of(node: nuke.Node, reads: list[nuke.Node]) -> range:
     """Return the frames of the knob; if it is empty, those that all Reads have."""
-    text = _text(node, "frames")
-    if text:
+    if text := _text(node, "frames"):
         return parse_range(text)
     frames = range(max(read.firstFrame() for read in reads), min(read.lastFrame() for read in reads) + 1)
     if not frames:
@@ -303,8 +289,8 @@ def _load(job: _Job, node_name: str, written: list[int]) -> None:
 
 def _made_read(node_name: str) -> nuke.Node | None:
     """Return the Read that an earlier job made for a node of the current group."""
-    reads = (n for n in nuke.allNodes("Read") if n.knob(_MADE_BY) and n[_MADE_BY].value() == node_name)
-    return next(reads, None)
+    reads = nuke.allNodes("Read")
+    return next((n for n in reads if n.knob(_MADE_BY) and n[_MADE_BY].value() == node_name), None)
 
 
 def _new_read(node: nuke.Node, node_name: str) -> nuke.Node:
@@ -319,9 +305,6 @@ def _new_read(node: nuke.Node, node_name: str) -> nuke.Node:
 
 # ------------------------------------------------------------------------------- rebuild the beauty, in the main thread
 
-#: What the output of the group shows, by the index of the knob "show".
-_REBUILD, _DIFFERENCE = "rebuild", "difference"
-
 
 def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
     """Make a group that adds up the layers of a set, and shows the sum or its difference from the beauty.
@@ -331,7 +314,7 @@ def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
     group = nuke.nodes.Group()
     group.setName("Rebuild_" + re.sub(r"\W", "_", fused.name))
     group.setInput(0, read)
-    show = nuke.Enumeration_Knob("show", "show", [_REBUILD, _DIFFERENCE])
+    show = nuke.Enumeration_Knob("show", "show", ["rebuild", "difference"])
     show.setTooltip("rebuild: the sum of the layers. difference: how far it is from the fused beauty.")
     exposure = nuke.Double_Knob("exposure", "difference exposure")
     exposure.setTooltip(
@@ -344,7 +327,10 @@ def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
         source = nuke.nodes.Input()
         total: nuke.Node | None = None
         for column, term in enumerate(fused.terms):
-            light, *colours = (_shuffle(source, layer, 120 * column, 100 + 50 * i) for i, layer in enumerate(term))
+            light, *colours = (
+                _node("Shuffle", [source], 120 * column, 100 + 50 * i, **{"in": layer, "label": layer})
+                for i, layer in enumerate(term)
+            )
             for colour in colours:
                 light = _merge("multiply", light, colour, 120 * column, 200)
             total = light if total is None else _merge("plus", total, light, 120 * column, 300)
@@ -354,14 +340,9 @@ def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
         gain = _node("Multiply", [difference], 120, 450, channels="rgb")
         gain["value"].setExpression("pow(2, parent.exposure)")
         switch = _node("Switch", [alpha, gain], 0, 500)
-        switch["which"].setExpression("parent.show")
+        switch["which"].setExpression("parent.show")  # the index of its value
         _node("Output", [switch], 0, 550)
     return group
-
-
-def _shuffle(source: nuke.Node, layer: str, x: int, y: int) -> nuke.Node:
-    """Make a Shuffle that shows a layer as rgb."""
-    return _node("Shuffle", [source], x, y, **{"in": layer, "label": layer})
 
 
 def _merge(operation: str, b: nuke.Node, a: nuke.Node, x: int, y: int) -> nuke.Node:

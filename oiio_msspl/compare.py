@@ -26,9 +26,6 @@ from oiio_msspl.image.metrics import RELMSE_GHARBI, SSIM_WINDOW, psnr, relmse, r
 from oiio_msspl.jobs.report import WEIGHTS_ATTRIBUTE
 from oiio_msspl.model.contract import SCALES
 
-#: The "Software" entry of error maps. It differs from that of previews, because fusing deletes old previews.
-ERROR_MAP_SOFTWARE = f"{SOFTWARE} compare"
-
 
 def scores(image: Array, reference: Array) -> dict[str, float]:
     """Measure an image, scene linear (height, width, 3), by all metrics of :mod:`oiio_msspl.image.metrics`.
@@ -95,11 +92,10 @@ def open_comparison(images: Sequence[Path], reference: Path | None = None, layer
     mapping = {RGB: layer} if layer else {}
     renders: list[MappedRender] = []
     for path in [*images, *([reference] if reference else [])]:
-        file = open_exr(path)
-        render = map_render(file, mapping, features=())
+        render = map_render(open_exr(path), mapping, features=())
         view = renders[0].view if renders else ""
         if view != render.view and any(view in (label, *label.split("/")) for label in render.other_views):
-            render = map_render(file, mapping, view=view, features=())
+            render = map_render(render.file, mapping, view=view, features=())
         renders.append(render)
     sizes = [render.data_window.width * render.data_window.height for render in renders]
     largest = len(renders) - 1 if reference else sizes.index(max(sizes))
@@ -184,10 +180,6 @@ class _Place:
     shown: Window
     """The pixels of the largest render that this one shows."""
 
-    def pixel(self, x: int, y: int) -> tuple[int, int]:
-        """Return the render's pixel at a pixel of the largest one."""
-        return (x - self.x0) // self.scale, (y - self.y0) // self.scale
-
 
 def common_windows(renders: Sequence[MappedRender], largest: MappedRender) -> list[Window]:
     """Return the rectangles, in the pixels of every render, over which all of them are compared.
@@ -215,8 +207,8 @@ def common_windows(renders: Sequence[MappedRender], largest: MappedRender) -> li
     if len(columns) < 2 or len(rows) < 2:
         names = ", ".join(f"{render.name} ({render.data_window})" for render in renders)
         raise InputError(f"these pictures have no part of the frame in common: {names}; compare those of one part")
-    corners = ((columns[0], rows[0]), (columns[-1], rows[-1]))
-    return [Window(*(side for x, y in corners for side in place.pixel(x, y))) for place in places]
+    shared = Window(columns[0], rows[0], columns[-1], rows[-1])
+    return [Window(*(side // p.scale for side in astuple(shared.shift(-p.x0, -p.y0)))) for p in places]
 
 
 def _place(render: MappedRender, largest: MappedRender) -> _Place:
@@ -239,28 +231,24 @@ def _scale(window: Window, larger: Window) -> int | None:
     return next((scale for scale in (1, *SCALES) if all(a in (b // scale, -(-b // scale)) for a, b in sides)), None)
 
 
-def check_error_map(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None:
-    """Raise InputError if no map of the files ``compared`` can be written at ``path``, which must end with .png."""
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: the error map is a PNG; name it .png")
+def check_output(path: Path, kind: str, suffixes: Sequence[str], compared: Sequence[Path], *, overwrite: bool) -> None:
+    """Raise InputError if ``path`` has another suffix, or can't be written beside the files ``compared``."""
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: {kind}; name it {suffixes[0]}")
     check_target(path, overwrite=overwrite)
     check_separate(compared, [path])
 
 
 def write_error_map(path: Path, comparison: Comparison, *, overwrite: bool) -> None:
-    """Write the :func:`error_map` of the first image as a PNG.
+    """Write the :func:`error_levels` of the first image in :func:`error_colours` as a PNG.
 
     Raises:
         InputError: pixels can't be read, or ``path`` exists.
         MssplError: the PNG can't be written.
     """
-    picture = error_map(comparison.image(0), comparison.truth)
-    write_png(path, picture, software=ERROR_MAP_SOFTWARE, overwrite=overwrite)
-
-
-def error_map(image: Array, truth: Array) -> Array:
-    """Return the :func:`error_levels` of an image in :func:`error_colours`: display values, (height, width, 3)."""
-    return error_colours(error_levels(image, truth))
+    picture = error_colours(error_levels(comparison.image(0), comparison.truth))
+    # Not the name of a preview, because fusing deletes old previews.
+    write_png(path, picture, software=f"{SOFTWARE} compare", overwrite=overwrite)
 
 
 def error_levels(image: Array, truth: Array) -> Array:

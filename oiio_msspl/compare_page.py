@@ -36,7 +36,7 @@ from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.compare import Comparison, error_colours, error_levels, in_space_of, upsampled_like
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import check_separate, check_target, replacing
+from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.layers import Layer, layers_of, matches_layer, same_spelling
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
@@ -61,16 +61,6 @@ _CLIPPED = 0.005
 BEAUTY = "beauty"
 
 Codes = NDArray[np.int16]
-
-
-@dataclass(frozen=True)
-class PageSummary:
-    """Size and layers of a page."""
-
-    size: int
-    """Bytes of the file."""
-    layers: tuple[str, ...]
-    """Names of the layers on the page."""
 
 
 @dataclass(frozen=True)
@@ -109,14 +99,6 @@ class _Picture:
         return repair(values)[0] if layer.is_colour else values
 
 
-def check_page(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None:
-    """Raise InputError if no page of the files ``compared`` can be written at ``path``, which must end with .html."""
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{path}: the page is HTML; name it .html")
-    check_target(path, overwrite=overwrite)
-    check_separate(compared, [path])
-
-
 def check_layers(comparison: Comparison, layers: Sequence[str]) -> None:
     """Raise InputError if no file has a layer of a pattern, by the headers alone."""
     _chosen(list(map(_picture, comparison.renders, comparison.windows)), layers)
@@ -129,16 +111,17 @@ def write_page(
     layers: Sequence[str] = (),
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> PageSummary:
+) -> tuple[int, list[str]]:
     """Write a page that shows images, their reference, and their errors.
 
     Args:
-        path: the page to write.
         comparison: the images, and perhaps a reference. Without it, scores and error maps are left out. A smaller image
             is shown with large pixels, and upsampled bicubically for scores and error maps.
         layers: patterns of the layers to show beside the beauty. Without any, those that sum to the beauty are shown.
-        overwrite: replace an existing file.
         progress: called with the number of layers done and of all.
+
+    Returns:
+        Bytes of the file, and names of the layers on the page.
 
     Raises:
         InputError: a file can't be read, no file has a layer of a pattern, or ``path`` exists.
@@ -160,8 +143,7 @@ def write_page(
             text = json.dumps(manifest, allow_nan=False).replace("<", "\\u003c")
             out.write(f'<script type="application/json" id="manifest">{text}</script>')
             out.write(tail)
-        size = temporary.stat().st_size
-    return PageSummary(size, tuple(layer["name"] for layer in shown))
+        return temporary.stat().st_size, [layer["name"] for layer in shown]
 
 
 def _picture(render: MappedRender, window: Window) -> _Picture:
@@ -190,8 +172,7 @@ def _picture(render: MappedRender, window: Window) -> _Picture:
 
 def _groups(layer: Layer) -> Iterator[tuple[tuple[Channel, ...], str]]:
     """Yield the channels of a layer that make a picture, three or one, with their component's name."""
-    triple = layer.triple() or ()
-    if triple:
+    if triple := layer.triple() or ():
         yield triple, ""
     for component, channel in layer.channels.items():
         if channel not in triple and (component != "A" or len(layer.channels) == 1):
@@ -200,10 +181,8 @@ def _groups(layer: Layer) -> Iterator[tuple[tuple[Channel, ...], str]]:
 
 def _chosen(pictures: Sequence[_Picture], patterns: Sequence[str]) -> list[str]:
     """Return the keys of the layers to show: the beauty, and those of the patterns, or else of additive sets."""
-    candidates: dict[str, list[_Layer]] = {}
-    for picture in pictures:
-        for key, layer in picture.layers.items():
-            candidates.setdefault(key, []).append(layer)
+    keys = dict.fromkeys(key for picture in pictures for key in picture.layers)
+    candidates = {key: [picture.layers[key] for picture in pictures if key in picture.layers] for key in keys}
     if not patterns:
         return [key for key, layers in candidates.items() if key == BEAUTY or any(layer.additive for layer in layers)]
     chosen = {BEAUTY}
@@ -222,9 +201,8 @@ def _write_layer(
     """Write the codes of a layer's pictures and error maps, and return the layer's entry in the manifest."""
     holders = [(place, picture) for place, picture in enumerate(pictures) if key in picture.layers]
     first = holders[0][1].layers[key]
-    truth = None
-    if reference is not None and first.is_colour and key in reference.layers and reference.layers[key].is_colour:
-        truth = reference.read(key)
+    is_scored = first.is_colour and reference and key in reference.layers and reference.layers[key].is_colour
+    truth = reference.read(key) if reference and is_scored else None
     value_range: tuple[float, float] | None = None
     images: dict[int, Any] = {}
     errors: dict[int, Any] = {}
@@ -236,7 +214,7 @@ def _write_layer(
             black, white = value_range = value_range or _range_of(values)
             shown = np.nan_to_num((values - black) / (white - black))
         images[place] = _write_codes(out, f"image-{index}-{place}", to_codes(shown))
-        if truth is not None and reference is not None and picture is not reference and picture.layers[key].is_colour:
+        if truth is not None and reference and picture is not reference and picture.layers[key].is_colour:
             image = upsampled_like(in_space_of(values, picture.render, reference.render), truth)
             decibels = psnr(image, truth)
             images[place] |= {"psnr": decibels if math.isfinite(decibels) else None, "relmse": relmse(image, truth)}
@@ -299,20 +277,13 @@ def _write_codes(out: TextIO, name: str, codes: Codes) -> dict[str, Any]:
     return {"id": name, "width": width, "height": height, "channels": channels, "differences": smooth}
 
 
-def _names_of(paths: Sequence[Path]) -> list[str]:
-    """Return the names of files, below their common folder where two have one name: nobody else's page tells a path."""
-    names = [path.name for path in paths]
-    common = os.path.commonpath([path.absolute().parent for path in paths])
-    below = [path.absolute().relative_to(common).as_posix() for path in paths]
-    return [name if names.count(name) == 1 else longer for name, longer in zip(names, below, strict=True)]
-
-
 def _manifest(
     pictures: Sequence[_Picture], largest: _Picture, has_reference: bool, layers: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
     """Describe the pictures and layers for the page's script."""
     colours = error_colours(np.linspace(0, 1, ERROR_LEVELS, dtype=np.float32)[None])[0]
-    paths = [picture.render.file.path for picture in pictures]
+    paths = [picture.render.file.path.absolute() for picture in pictures]
+    names, common = [path.name for path in paths], os.path.commonpath([path.parent for path in paths])
     return {
         "height": largest.window.height,
         "width": largest.window.width,
@@ -320,7 +291,8 @@ def _manifest(
         "codesPerStop": CODES_PER_STOP,
         "stopsBelowOne": STOPS_BELOW_ONE,
         "errorColours": np.round(colours * 255).astype(int).tolist(),
-        "pictures": _names_of(paths),
+        # Where two have one name, the paths below their common folder: others need not know where the files lie.
+        "pictures": [p.name if names.count(p.name) == 1 else p.relative_to(common).as_posix() for p in paths],
         "reference": len(pictures) - 1 if has_reference else None,
         "layers": list(layers),
     }

@@ -67,10 +67,9 @@ class Inspection:
         return self.contract.name.removesuffix(f"-x{self.contract.scale}") if self.contract else ""
 
     def aovs(self, view: MappedRender | None = None) -> list[dict[str, str]]:
-        """List the layers that the model would read: rows of ``MappedRender.table``.
+        """List the layers of ``render``, or of one of ``other_views``, that the model would read.
 
-        Args:
-            view: one of ``other_views``; None for ``render``.
+        Returns rows of ``MappedRender.table``.
         """
         render = view or self.render
         assert render is not None and self.contract is not None
@@ -189,7 +188,8 @@ def inspect_noise(inspections: Sequence[Inspection]) -> None:
     renders = [(inspection.render, inspection) for inspection in inspections if inspection.render is not None]
     if len(renders) not in (1, 2) or len(renders) < len(inspections):
         return
-    (lr, low), (hr, high) = sorted(2 * renders if len(renders) == 1 else renders, key=_width)
+    pair = sorted(2 * renders if len(renders) == 1 else renders, key=lambda item: item[0].display_window.width)
+    (lr, low), (hr, high) = pair
     try:
         spread = is_noise_spread(lr, hr, align(lr, hr))
         high.advice = advise(lr, hr, spread, in_shot=next_file(high.path) is not None)
@@ -201,10 +201,6 @@ def inspect_noise(inspections: Sequence[Inspection]) -> None:
     text = "the pixel filter has spread it over neighbouring pixels" if spread else "independent in each pixel"
     compared = "" if low is high else f", compared with {low.path.name}"
     high.facts.append(f"noise{compared}: {text}")
-
-
-def _width(pair: tuple[MappedRender, Inspection]) -> int:
-    return pair[0].display_window.width
 
 
 def _look_at_sets(result: Inspection, render: MappedRender) -> list[str]:

@@ -7,7 +7,8 @@ import OpenImageIO as oiio
 import pytest
 
 from oiio_msspl.compare import (
-    error_map,
+    error_colours,
+    error_levels,
     note_on_spaces,
     note_on_views,
     note_on_weights,
@@ -205,7 +206,7 @@ def test_the_error_map_spans_five_decades():
     truth = np.zeros((1, 6, 3), np.float32)
     errors = np.float64([1e-6, 1e-5, 10**-2.5, 10**-1.25, 1, 10])
     image = np.sqrt(errors * 0.01 / 0.5)[None, :, None] * np.ones(3)
-    colours = error_map(image.astype(np.float32), truth)[0]
+    colours = error_colours(error_levels(image.astype(np.float32), truth))[0]
     np.testing.assert_allclose(colours[0], colours[1], atol=0.01)
     np.testing.assert_allclose(colours[4], colours[5], atol=0.01)
     assert colours[1].sum() < 0.1 and colours[4].sum() > 2.3

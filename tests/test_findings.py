@@ -3,10 +3,11 @@
 
 import ast
 import copy
+import re
 from pathlib import Path
 
 import oiio_msspl
-from oiio_msspl.findings import ADVICE, CODES, Finding, codes_of
+from oiio_msspl.findings import Finding, codes_of
 from tests.test_pages import ROOT
 
 
@@ -16,9 +17,8 @@ def test_every_code_is_used_and_documented():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding":
                 used |= {node.args[0].value} if isinstance(node.args[0], ast.Constant) else set()
-    assert used == {*CODES, *ADVICE}
     page = (ROOT / "docs/api.md").read_text(encoding="utf-8")
-    assert all(f"| `{code}` | {text} |" in page for code, text in (CODES | ADVICE).items())
+    assert sorted(used) == sorted(re.findall(r"^\| `(\w+)` \| \S.* \|$", page, re.MULTILINE))
 
 
 def test_a_finding_is_its_sentence():

@@ -9,18 +9,15 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from msspl_bridge.errors import FuseError
+from msspl_bridge import FuseError
 from msspl_bridge.frame_files import FrameFile, with_slashes
 
 #: Variables that the host sets for its own Python. Another Python may not start with them.
 _PYTHON_VARIABLES = ("PYTHONHOME", "PYTHONPATH", "PYTHONEXECUTABLE", "PYTHONPLATLIBDIR", "__PYVENV_LAUNCHER__")
 #: Search paths to which the host may add its own libraries.
 _LIBRARY_PATHS = (
-    "LD_LIBRARY_PATH",
-    "LD_PRELOAD",
-    "DYLD_LIBRARY_PATH",
-    "DYLD_FRAMEWORK_PATH",
-    "DYLD_INSERT_LIBRARIES",
+    *("LD_LIBRARY_PATH", "LD_PRELOAD"),
+    *("DYLD_LIBRARY_PATH", "DYLD_FRAMEWORK_PATH", "DYLD_INSERT_LIBRARIES"),
 )
 
 
@@ -71,7 +68,10 @@ def build_command(
     first, last = numbers or (number, number)
     in_shot = numbers is not None or all(file.number == number is not None for file in files)
     *renders, result = (file.pattern if in_shot else file.path for file in files)
-    command = [*([_msspl_beside(program), "submit"] if bundle else [program]), *renders, "-o", result]
+    msspl = shutil.which("msspl", path=os.path.dirname(program)) if bundle else ""
+    if msspl is None:
+        raise FuseError(f"there is no msspl beside {program}; name msspl-fuse where the package is installed")
+    command = [*([msspl, "submit"] if bundle else [program]), *renders, "-o", result]
     if in_shot:
         command += ["--frames", f"{first}" if first == last else f"{first}-{last}", "--temporal", settings.temporal]
     if bundle:
@@ -81,13 +81,6 @@ def build_command(
         command += ["--progress", "json"] if in_shot else []
         command += ["--overwrite"] if settings.overwrite else ["--skip-existing"] if numbers else []
     return command + _options(settings)
-
-
-def _msspl_beside(program: str) -> str:
-    found = shutil.which("msspl", path=os.path.dirname(program))
-    if found is None:
-        raise FuseError(f"there is no msspl beside {program}; name msspl-fuse where the package is installed")
-    return found
 
 
 def _options(settings: Settings) -> list[str]:
@@ -145,10 +138,8 @@ def clean_environment(environment: Mapping[str, str], host_folder: str) -> dict[
     clean = {key: value for key, value in environment.items() if key not in _PYTHON_VARIABLES}
     folder = os.path.join(os.path.realpath(host_folder), "")
     for key in _LIBRARY_PATHS:
-        if key in clean:
-            paths = clean.pop(key).split(os.pathsep)
-            kept = [p for p in paths if p and not os.path.join(os.path.realpath(p), "").startswith(folder)]
-            if kept:
-                clean[key] = os.pathsep.join(kept)
+        paths = clean.pop(key, "").split(os.pathsep)
+        if kept := [p for p in paths if p and not os.path.join(os.path.realpath(p), "").startswith(folder)]:
+            clean[key] = os.pathsep.join(kept)
     # Messages arrive in UTF-8 on every platform, without delay, and each in a line of its own.
     return {**clean, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "TERMINAL_WIDTH": "10000"}

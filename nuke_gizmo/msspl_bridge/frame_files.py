@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from msspl_bridge.errors import FuseError
+from msspl_bridge import FuseError
 
 _NUMBER = re.compile(r"%(0?)(\d*)d|#+")
 _VIEW = re.compile(r"%[vV]")

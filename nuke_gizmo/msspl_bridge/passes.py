@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from msspl_bridge.errors import FuseError
+from msspl_bridge import FuseError
 
 #: Where Nuke shows the EXR attribute in which msspl-fuse names the layers that it has fused.
 ATTRIBUTE = "exr/msspl/passes"

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from msspl_bridge.errors import FuseError
+from msspl_bridge import FuseError
 
 #: The box that the command line draws around a mistake in the options.
 _BOX = " \u2502\n"
@@ -100,6 +100,10 @@ def run(commands: Sequence[list[str]], environment: Mapping[str, str], window: A
 
 
 def _start(command: list[str], environment: Mapping[str, str]) -> subprocess.Popen[str]:
+    # In a new process group, so that cancelling also ends the children of msspl-fuse; without a console window.
+    group: dict[str, Any] = {"start_new_session": True}
+    if sys.platform == "win32":
+        group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
     try:
         return subprocess.Popen(
             command,
@@ -109,7 +113,7 @@ def _start(command: list[str], environment: Mapping[str, str]) -> subprocess.Pop
             stderr=subprocess.STDOUT,
             encoding="utf-8",
             errors="replace",
-            **_own_group(),
+            **group,
         )
     except OSError as error:
         raise FuseError(f"{command[0]}: can't be started ({error.strerror}); check the path") from error
@@ -133,13 +137,6 @@ def _read_lines(process: subprocess.Popen[str], lines: queue.Queue[str | None]) 
         for line in process.stdout:
             lines.put(line)
     lines.put(None)
-
-
-def _own_group() -> dict[str, Any]:
-    """Start a new process group, so that cancelling also ends the children of msspl-fuse. Open no console window."""
-    if sys.platform == "win32":
-        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
-    return {"start_new_session": True}
 
 
 def _end(process: subprocess.Popen[str]) -> None:

@@ -92,8 +92,8 @@ def find_additive_sets(
 
     Args:
         renderer: entry of the table.
-        layers: of the file.
-        beauty: the one that the sets should sum to; its view and view layer are searched.
+        layers: of the file, in which the view and view layer of ``beauty`` are searched.
+        beauty: the one that the sets should sum to.
         sums: the user's, as ``NAME=a+b+c*d``.
         file: the file, whose header may name layers; None for layers without a file.
 
@@ -130,37 +130,26 @@ class _Finder:
     def __init__(self, layers: Sequence[Layer], beauty: Beauty, names_of: Callable[[str], list[str]]) -> None:
         self._beauty, self._names_of = beauty, names_of
         named = beauty.layers_of_view(layers)
-        self._layers = [(n, layer) for n, layer in named if layer.triple() and layer is not beauty.layer]
-
-    @property
-    def known(self) -> str:
-        """What :meth:`find` looks for, for messages."""
-        names = ", ".join(layer.name for _, layer in self._layers[:12] if layer.name)
-        return f"; it has {names}" if names else ""
+        self.layers = [(n, layer) for n, layer in named if layer.triple() and layer is not beauty.layer]
 
     def find(self, candidate: str | Mapping[str, str]) -> Iterator[AdditiveLayer]:
         """Yield the layers that an entry of the table means; none if a factor is missing."""
         entry = entry_of(candidate)
-        factor = next((layer.triple() for _, layer in self._named(entry["times"])), None) if "times" in entry else None
-        if "times" in entry and factor is None:
-            return
-        for name, layer in self._named(entry["layer"]):
+        factors = [layer.triple() for _, layer in self._named(entry["times"])] if "times" in entry else [None]
+        for name, layer in self._named(entry["layer"]) if factors else ():
             channels = layer.triple()
-            assert channels is not None
-            if all(channel.type != "uint" for channel in channels):
-                yield AdditiveLayer(name, channels, factor)
+            if channels and all(channel.type != "uint" for channel in channels):
+                yield AdditiveLayer(name, channels, factors[0])
 
     def _named(self, alias: str) -> Iterator[tuple[str, Layer]]:
         """Yield the layers of a name, or of a pattern with ``*``, where ``_`` matters: ``C_*`` is not ``coat``."""
         if "*" in alias:
-            yield from (pair for pair in self._layers if fnmatchcase(pair[0].lower(), alias.lower()))
+            yield from (pair for pair in self.layers if fnmatchcase(pair[0].lower(), alias.lower()))
             return
         places = (self._beauty.view_layer, "")
         for name in self._names_of(alias):
-            found = [pair for pair in self._layers if view_layer_of(pair[1].name, name) in places]
-            if found:
-                exact = [pair for pair in found if pair[1].name.endswith(name)]
-                yield from exact or found
+            if found := [pair for pair in self.layers if view_layer_of(pair[1].name, name) in places]:
+                yield from [pair for pair in found if pair[1].name.endswith(name)] or found
                 return
 
 
@@ -177,8 +166,9 @@ def _user_set(finder: _Finder, text: str, path: str) -> AdditiveSet:
         is_pattern = term.endswith("*")
         matches = list(finder.find({"layer": layer, "times": factor} if times and not is_pattern else term))
         if not matches or (len(matches) > 1 and not is_pattern):
-            problem = f"several layers {term!r}" if matches else f"no layer {term!r} of three channels{finder.known}"
-            raise InputError(f"--sum {text!r}: {path} has {problem}")
+            known = ", ".join(layer.name for _, layer in finder.layers[:12] if layer.name)
+            no_layer = f"no layer {term!r} of three channels" + (f"; it has {known}" if known else "")
+            raise InputError(f"--sum {text!r}: {path} has {f'several layers {term!r}' if matches else no_layer}")
         lights |= dict.fromkeys(matches)
     if len(lights) < 2:
         raise no_sum

@@ -47,7 +47,6 @@ class LayerFinder:
         """Return the formula that a candidate describes; None if a layer is missing or has the wrong channels.
 
         Args:
-            feature: the feature that is wanted.
             candidate: checked by :func:`oiio_msspl.aovs.mapping.check_mapping`.
             problems: a sentence is added for a layer that exists but has the wrong channels.
 
@@ -61,25 +60,26 @@ class LayerFinder:
         if layer.startswith("file:") and path and not layer_in_file and "times" not in entry:
             extras = {key: entry[key] for key in ("kind", "encoding", "note") if key in entry}
             return replace(self._formula_of_file(feature, Path(path)), **extras)
-        groups: list[tuple[Channel, ...]] = []
-        names: list[str] = []
+        found = []
         for alias in _aliases(entry):
-            group = self._group(feature, alias, problems)
-            if group is None:
+            if (group := self._group(feature, alias, problems)) is None:
                 return None
-            groups.append(group[0])
-            names.append(group[1])
+            found.append(group)
+        groups = [channels for channels, _ in found]
         factor = groups.pop() if "times" in entry else None
         kind = "halves" if "halves" in entry else entry.get("kind", "mean")
         encoding, note = entry.get("encoding", "signed"), entry.get("note", "")
-        return FeatureFormula(tuple(groups), factor, kind, encoding, _text(names, factor is not None), note)
+        text = _text([name for _, name in found], factor is not None)
+        return FeatureFormula(tuple(groups), factor, kind, encoding, text, note)
 
     def _group(
         self, feature: str, alias: str | list[str], problems: list[str]
     ) -> tuple[tuple[Channel, ...], str] | None:
         """Return the channels of a layer, or of a list of channel names, and their name for the user."""
         if isinstance(alias, list):
-            stored = self._channels()
+            # Of equal names, the chosen view's first one.
+            layers = sorted(self._layers, key=lambda layer: layer.view != self._view)
+            stored = {c.name: c for layer in reversed(layers) for c in reversed(layer.channels.values())}
             return (tuple(stored[c] for c in alias), " ".join(alias)) if all(c in stored for c in alias) else None
         layer = self._layer(feature, alias)
         if layer is None:
@@ -90,27 +90,21 @@ class LayerFinder:
             return None
         return group, layer.name or " ".join(channel.name for channel in group)
 
-    def _channels(self) -> dict[str, Channel]:
-        """Return channels by their stored names; of equal names, the chosen view's first one."""
-        layers = sorted(self._layers, key=lambda layer: layer.view != self._view)
-        return {c.name: c for layer in reversed(layers) for c in reversed(layer.channels.values())}
-
     def _formula_of_file(self, feature: str, path: Path) -> FeatureFormula:
         """Find the feature of another render by the table of renderers, or else take its only layer."""
         file = self._open(path)
         layers = layers_of(file)
         renderer = detect_renderer(file, layers)
-        place = self._view, self._view_layer
+        own = self._view, self._view_layer
+        words = [(layer.view, layer.name.split(".")) for layer in layers]
+        others = {(view, ".".join(name[:count])) for view, name in words for count in range(len(name))} - {own}
+        # This render's own view and view layer count more than the others.
+        places = ([own], sorted(others))
         formulas: dict[tuple[Channel, ...], FeatureFormula] = {}
-        for candidate in candidates_of(renderer, feature):
-            for view, view_layer in _views_and_view_layers(layers, place):
-                formula = LayerFinder(file, layers, renderer, view, view_layer).formula(feature, candidate, [])
-                if formula is not None:
+        for candidate, views in itertools.product(candidates_of(renderer, feature), places):
+            for view, view_layer in views if not formulas else ():
+                if formula := LayerFinder(file, layers, renderer, view, view_layer).formula(feature, candidate, []):
                     formulas.setdefault(tuple(formula.channels), formula)
-                if formulas and (view, view_layer) == place:
-                    break  # this render's own view layer counts more than the others
-            if formulas:
-                break
         self._file.siblings.update(file.siblings)
         if not formulas:
             layer = _only_layer(path, layers, feature, renderer)
@@ -204,13 +198,6 @@ def _only_layer(path: Path, layers: list[Layer], feature: str, renderer: dict[st
 def _name_a_layer(path: Path, feature: str, problem: str, layers: Sequence[str]) -> str:
     example = next((name for name in layers if name != "R G B"), "LAYER")
     return f"{path}: {problem}; name one, as --map '{feature}={path.name}:{example}'"
-
-
-def _views_and_view_layers(layers: list[Layer], first: tuple[str, str]) -> list[tuple[str, str]]:
-    """Return all pairs of a view and a view layer that a file's layers may have, ``first`` in front."""
-    words = [(layer.view, layer.name.split(".")) for layer in layers]
-    prefixes = {(view, ".".join(name[:count])) for view, name in words for count in range(len(name))}
-    return [first, *sorted(prefixes - {first})]
 
 
 def mapped_files(mapping: Mapping[str, Any], path: Path) -> set[Path]:

@@ -112,7 +112,7 @@ class MappedRender:
         that is read in part or has no name, the channels are named. The view follows in brackets if it is not the
         chosen one.
         """
-        used = {c for view in (self, *views) for formula in view._formulas.values() for c in formula.channels}
+        used = {c for view in (self, *views) for formula in view.formulas.values() for c in formula.channels}
         used |= {channel for additive in fused for layer in additive.layers for channel in layer.channels}
         names = []
         for layer in layers_of(self.file):
@@ -123,7 +123,7 @@ class MappedRender:
         return names
 
     @property
-    def _formulas(self) -> dict[str, FeatureFormula]:
+    def formulas(self) -> dict[str, FeatureFormula]:
         """The features and, if there is one, the alpha."""
         return self.features | ({"alpha": FeatureFormula(((self.alpha,),))} if self.alpha else {})
 
@@ -141,7 +141,7 @@ class MappedRender:
         self, window: Window, features: Iterable[str] | None, more: Sequence[Channel]
     ) -> tuple[dict[str, Array], Array]:
         """Read features and, as they are stored, more channels, (height, width, channels)."""
-        available = self._formulas
+        available = self.formulas
         names = (*FEATURES, "alpha") if features is None else features
         formulas = {name: available[name] for name in names if name in available}
         beauty = self.features[RGB].terms[0] if VARIANCE in formulas else ()

@@ -53,7 +53,6 @@ def map_render(
     """Find the features of :mod:`oiio_msspl.aovs.features` among a file's layers.
 
     Args:
-        file: from :func:`oiio_msspl.exr.reader.open_exr`.
         mapping: the user's candidates by feature. They replace those of the table, and their layers must exist.
         view: view (``left``) or view layer (``ViewLayer``) to take; the file's first if None.
         spp: samples per pixel, if the header does not say or is wrong.
@@ -71,25 +70,24 @@ def map_render(
     layers = layers_of(file)
     mapping = check_mapping(dict(mapping or {}), "mapping")
     renderer = detect_renderer(file, layers)
-    if RGB not in mapping:
-        _check_holds_beauty(renderer, file)
-    beauties = find_beauties(file, layers, [mapping[RGB]] if RGB in mapping else _beauty_candidates(renderer, file))
-    if not beauties and RGB not in mapping:
-        beauties = find_beauties(file, layers, only_colour(layers, known_as_other(renderer)))
-    if not beauties:
-        raise _no_beauty(file, layers, mapping.get(RGB))
+    beauties = _beauties(file, layers, renderer, mapping.get(RGB))
     beauty = choose_beauty(file, beauties, view)
+    rgb = beauty.layer.triple()
+    assert rgb is not None
     notes: list[str] = []
-    formulas = {RGB: _beauty_formula(beauty)}
+    formulas = {RGB: FeatureFormula((rgb,), text=beauty.layer.name or " ".join(c.name for c in rgb))}
     finder = LayerFinder(file, layers, renderer, beauty.view, beauty.view_layer)
     for feature in features:
-        if feature in mapping:
-            formulas[feature] = _user_formula(finder, feature, mapping[feature], file)
-            continue
-        candidates = (finder.formula(feature, candidate, notes) for candidate in candidates_of(renderer, feature))
-        usable = (found for found in candidates if found and not _holds_integers(feature, found, notes))
-        if (formula := next(usable, None)) is not None:
+        problems: list[str] = []
+        if feature not in mapping:
+            candidates = (finder.formula(feature, candidate, notes) for candidate in candidates_of(renderer, feature))
+            usable = (found for found in candidates if found and not _holds_integers(feature, found, notes))
+            if formula := next(usable, None):
+                formulas[feature] = formula
+        elif formula := finder.formula(feature, mapping[feature], problems):
             formulas[feature] = formula
+        else:
+            raise InputError(f"{file.path}: {problems[0] if problems else missing(feature, mapping[feature], file)}")
     _check_no_integers(formulas)
     alpha = find_alpha(layers, beauty)
     if alpha is not None and alpha.type == "uint":
@@ -116,32 +114,35 @@ def map_render(
     return render
 
 
-def _beauty_candidates(renderer: Mapping[str, Any], file: ExrFile) -> list[Any]:
-    """Return the candidates of the beauty; a layer that the header names comes first."""
-    named = [name for name in names_of_aov(renderer, file, RGB) if name != RGB]
-    return [*named, *candidates_of(renderer, RGB)]
+def _beauties(file: ExrFile, layers: list[Layer], renderer: dict[str, Any], mapped: Any) -> list[Beauty]:
+    """Return the beauties of all views, by what the user has ``mapped`` or else by the table, or raise InputError."""
+    if mapped is not None:
+        beauties = find_beauties(file, layers, [mapped])
+    elif "not_beauty" in renderer and re.search(renderer["not_beauty"], file.path.stem):
+        raise InputError(
+            f"{file.path}: holds {renderer['name']}'s {file.path.stem} alone, no beauty; give the RGB file beside it "
+            "(or pass --map rgb=LAYER to use this one)"
+        )
+    else:
+        named = [name for name in names_of_aov(renderer, file, RGB) if name != RGB]  # in the header
+        beauties = find_beauties(file, layers, [*named, *candidates_of(renderer, RGB)])
+        beauties = beauties or find_beauties(file, layers, only_colour(layers, known_as_other(renderer)))
+    if not beauties:
+        raise _no_beauty(file, layers, mapped)
+    return beauties
 
 
 def _small_windows(render: MappedRender) -> list[str]:
     """Return a note on each feature whose part does not cover the beauty's data window."""
     notes, whole = [], render.data_window
-    alpha = {"alpha": [render.alpha]} if render.alpha else {}
-    for name, channels in ({key: formula.channels for key, formula in render.features.items()} | alpha).items():
-        owners = [render.file.siblings.get(channel.path, render.file).parts[channel.part] for channel in channels]
+    for name, formula in render.formulas.items():
+        owners = [render.file.siblings.get(c.path, render.file).parts[c.part] for c in formula.channels]
         if small := next((part for part in owners if whole.intersect(part.data_window) != whole), None):
             window = small.data_window
             notes.append(
                 f"{name}: its part '{small.name}' covers only {window} of {whole}, so it counts as 0 elsewhere"
             )
     return notes
-
-
-def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:
-    if "not_beauty" in renderer and re.search(renderer["not_beauty"], file.path.stem):
-        raise InputError(
-            f"{file.path}: holds {renderer['name']}'s {file.path.stem} alone, no beauty; give the RGB file beside it "
-            "(or pass --map rgb=LAYER to use this one)"
-        )
 
 
 def _no_beauty(file: ExrFile, layers: list[Layer], mapped: Any) -> InputError:
@@ -161,32 +162,16 @@ def _no_beauty(file: ExrFile, layers: list[Layer], mapped: Any) -> InputError:
     return InputError(f"{file.path}: no beauty (R, G, B) found among: {names}; name it with --map rgb=LAYER")
 
 
-def _beauty_formula(beauty: Beauty) -> FeatureFormula:
-    rgb = beauty.layer.triple()
-    assert rgb is not None
-    return FeatureFormula((rgb,), text=beauty.layer.name or " ".join(c.name for c in rgb))
-
-
-def _user_formula(finder: LayerFinder, feature: str, candidate: Any, file: ExrFile) -> FeatureFormula:
-    problems: list[str] = []
-    formula = finder.formula(feature, candidate, problems)
-    if formula is None:
-        raise InputError(f"{file.path}: {problems[0] if problems else missing(feature, candidate, file)}")
-    return formula
-
-
 def _holds_integers(feature: str, formula: FeatureFormula, notes: list[str]) -> bool:
     """Return whether a layer that is found by its name can't be the feature, and note it."""
-    integers = [channel for channel in formula.channels if channel.type == "uint"]
-    if integers:
+    if holds := any(channel.type == "uint" for channel in formula.channels):
         notes.append(f"{feature}: {formula.text} holds integers (ids, not light), so it is not read")
-    return bool(integers)
+    return holds
 
 
 def _check_no_integers(formulas: dict[str, FeatureFormula]) -> None:
     for feature, formula in formulas.items():
-        integers = [c for c in formula.channels if c.type == "uint"]
-        if integers:
+        if integers := [c for c in formula.channels if c.type == "uint"]:
             path = integers[0].path
             names = ", ".join(c.name for c in integers if c.path == path)
             raise InputError(

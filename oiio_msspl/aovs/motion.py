@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -124,14 +124,12 @@ class MotionLayers:
 def find_motion_layers(
     renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, read: Collection[Channel] = ()
 ) -> MotionLayers:
-    """Find the layers of motion vectors, position and depth.
-
-    The names that are common to all renderers are tried behind those of the renderer.
+    """Find the layers of motion vectors, position and depth in the view and view layer of a beauty.
 
     Args:
-        renderer: entry of the table.
+        renderer: entry of the table, whose names are tried before those that are common to all renderers.
         layers: of the file.
-        beauty: the one that was chosen; its view and view layer are searched.
+        beauty: the one that was chosen.
         read: channels that hold something else.
     """
     named = {name: layer for name, layer in beauty.layers_of_view(layers) if name}
@@ -139,7 +137,7 @@ def find_motion_layers(
     vectors: dict[tuple[Channel, Channel], MotionField] = {}
     for entry in [*renderer.get("motion", ()), *common["motion"]]:
         words = {key: value for key, value in entry.items() if key not in ("layer", "channels")}
-        for vector in _fields(named, entry["layer"], entry.get("channels"), MotionFormat(**words)):
+        for vector in _vectors_in(_named(named, entry["layer"]), entry.get("channels"), MotionFormat(**words)):
             vectors.setdefault(vector.channels, vector)
     positions = (_named(named, alias) for alias in [*renderer.get("position", ()), *common["position"]])
     depths = [d[1] for alias in [*renderer.get("depth", ()), *common["depth"]] if (d := _named(named, alias))]
@@ -161,18 +159,17 @@ def _guesses(
     unknown = {name: layer for name, layer in named.items() if len(layer.channels) in (2, 3) and not is_known(name)}
     unread = [name for name, layer in unknown.items() if not set(read).intersection(layer.channels.values())]
     unread.sort(key=lambda name: len(named[name].channels))
-    return [field for name in unread for field in _vectors_in(name, named[name], None, MotionFormat())][:MOST_GUESSES]
+    return [field for name in unread for field in _vectors_in((name, named[name]))][:MOST_GUESSES]
 
 
 def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionField]:
     """Find the motion vectors that the user's ``--motion-format`` describes.
 
     Args:
-        layers: of the file.
+        layers: those of the file ``path``.
         text: ``layer=NAME`` and any of ``channels=XY``, ``to=``, ``x=``, ``y=``, ``unit=``, ``scale=``, ``offset=`` and
             ``premultiplied``, separated by commas. Further layers follow behind ``+``. The pixels decide words that are
             left out.
-        path: of the file, for messages.
 
     Raises:
         InputError: the text can't be read, or the file has no such layer.
@@ -184,9 +181,8 @@ def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionF
         # Words that the user leaves out keep the values of the table, as long as the pixels agree.
         named = _named(layers.layers, layer)
         in_table = [f for f in layers.fields if named and f.layer == named[0]]
-        matching = [f for f in in_table if not letters or "".join(f.components) == letters] or list(
-            _fields(layers.layers, layer, list(letters) or None, MotionFormat())
-        )
+        matching = [f for f in in_table if not letters or "".join(f.components) == letters]
+        matching = matching or _vectors_in(named, letters)
         # A layer may hold vectors to both frames, in different channels.
         matching = [f for f in matching if f.format.to == words.get("to", f.format.to)] or matching
         if not matching:
@@ -248,18 +244,13 @@ def _depth_in(layer: Layer) -> list[Channel]:
     return [layer.channels[c] for c in "ZRVYT" if c in layer.channels] or [*(layer.scalar() or ())]
 
 
-def _fields(
-    layers: Mapping[str, Layer], alias: str, components: Sequence[str] | None, form: MotionFormat
-) -> Iterator[MotionField]:
-    """Yield the vectors of the layer that an alias means."""
-    if found := _named(layers, alias):
-        yield from _vectors_in(*found, components, form)
-
-
-def _vectors_in(name: str, layer: Layer, components: Sequence[str] | None, form: MotionFormat) -> Iterator[MotionField]:
-    """Yield the vectors of a layer: in these channels, or in the first usual ones."""
+def _vectors_in(
+    named: tuple[str, Layer] | None, components: Sequence[str] | None = None, form: MotionFormat | None = None
+) -> list[MotionField]:
+    """Return the vectors of a layer, if there is one, in these channels or in the first usual ones: one or none."""
+    name, layer = named or ("", Layer("", ""))
     for pair in [tuple(components)] if components else _PAIRS:
         channels = [layer.channels[c] for c in pair if c in layer.channels]
         if len(channels) == 2 and all(c.type != "uint" for c in channels) and channels[0].part == channels[1].part:
-            yield MotionField(name, (pair[0], pair[1]), (channels[0], channels[1]), form)
-            return
+            return [MotionField(name, (pair[0], pair[1]), (channels[0], channels[1]), form or MotionFormat())]
+    return []

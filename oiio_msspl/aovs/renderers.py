@@ -8,6 +8,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
@@ -65,12 +66,10 @@ def _names_in(entry: object) -> Iterator[str]:
     """Yield the names and patterns of layers in a candidate, or in a list of candidates."""
     if isinstance(entry, str):
         yield entry
-    elif isinstance(entry, list):
-        for element in entry:
+    elif isinstance(entry, Mapping | list):
+        keys = ("layer", "layers", "sum", "times", "halves")
+        for element in [entry.get(key, []) for key in keys] if isinstance(entry, Mapping) else entry:
             yield from _names_in(element)
-    elif isinstance(entry, Mapping):
-        for key in ("layer", "layers", "sum", "times", "halves"):
-            yield from _names_in(entry.get(key, []))
 
 
 def entry_of(candidate: str | Mapping[str, Any]) -> Mapping[str, Any]:
@@ -102,22 +101,16 @@ def names_of_aov(renderer: Mapping[str, Any], file: ExrFile, aov: str) -> list[s
     Several layers hold one AOV if lights are split into groups: none of the layers is the whole AOV.
     """
     if (number := renderer.get("types", {}).get(aov)) is not None:
-        return [*_layers_of_type(renderer, file, number), aov]
+        typed: list[str] = []
+        with suppress(ValueError, AttributeError, RecursionError):  # no such attribute, or other contents
+            elements = json.loads(str(file.metadata.get(renderer["types"]["attribute"])))
+            typed = [name for name, element in elements.items() if element.get("alias") == number]
+        return [*typed, aov] if len(typed) == 1 else [aov]
     if "source" not in renderer:
         return [aov]
     named = (key for key, value in file.metadata.items() if same_spelling(str(value)) == same_spelling(aov))
     layers = {match[1] for key in named if (match := re.search(renderer["source"], key))}
     return [aov, *layers] if len(layers) == 1 else [aov]
-
-
-def _layers_of_type(renderer: Mapping[str, Any], file: ExrFile, number: int) -> list[str]:
-    """Return the layer that has a type by the header's JSON; none if none or several have."""
-    try:
-        elements = json.loads(str(file.metadata.get(renderer["types"]["attribute"])))
-        layers = [name for name, element in elements.items() if element.get("alias") == number]
-    except (ValueError, AttributeError, RecursionError):  # no such attribute, or other contents
-        return []
-    return layers if len(layers) == 1 else []
 
 
 def view_layer_of(layer: str, alias: str) -> str | None:
@@ -163,7 +156,7 @@ def _holds_by_name(rule: dict[str, Any], path: Path) -> bool:
 
 def siblings_of(path: Path, aov: str) -> list[Path]:
     """Return the possible files of an AOV beside the beauty ``path``; the one named after the beauty comes first."""
-    return [path.with_name(f"{stem}.exr") for stem in (f"{path.stem}.{aov}", aov)]
+    return [path.with_name(f"{path.stem}.{aov}.exr"), path.with_name(f"{aov}.exr")]
 
 
 def sibling_of(path: Path, aov: str) -> Path | None:
@@ -192,19 +185,12 @@ def _with_word(name: str, aov: str) -> list[str]:
 
 def aov_files(path: Path) -> set[Path]:
     """Find the files of AOVs beside the beauty ``path`` by names, without opening the beauty."""
-    names: set[str] = set()
-    for renderer in renderers():
-        aovs = set(file_names(renderer))
-        if aovs and any(_holds_by_name(rule, path) for rule in renderer["detect"]):
-            names |= aovs
-    beside = {file for feature in (ALBEDO, NORMAL) for aov in _aovs_beside(feature) if (file := file_beside(path, aov))}
-    return beside | {file for name in names if (file := sibling_of(path, name))}
-
-
-def _aovs_beside(feature: str) -> list[str]:
-    """Return the AOVs of :func:`file_beside` that a feature may be read from."""
-    names = (entry_of(candidate).get("layer", "") for candidate in renderers()[-1][feature])
-    return [name.removeprefix("beside:") for name in names if name.startswith("beside:")]
+    by_name = [entry for entry in renderers() if any(_holds_by_name(rule, path) for rule in entry["detect"])]
+    siblings = {sibling_of(path, name) for name in file_names(by_name)}
+    common = renderers()[-1]
+    layers = [entry_of(candidate).get("layer", "") for candidate in [*common[ALBEDO], *common[NORMAL]]]
+    beside = {file_beside(path, name.removeprefix("beside:")) for name in layers if name.startswith("beside:")}
+    return {file for file in siblings | beside if file}
 
 
 def file_names(entry: object) -> Iterator[str]:

@@ -62,14 +62,10 @@ def find_beauties(file: ExrFile, layers: list[Layer], candidates: Sequence[Any])
 def only_colour(layers: list[Layer], is_known: Callable[[str], bool]) -> list[str]:
     """Return the name of the only layer of R, G, B that is not known as something else; nothing if there are several.
 
-    Args:
-        layers: of the file; a name may occur once in each view.
-        is_known: tells whether a layer of a name is known as something else.
+    ``is_known`` tells it by the name of a layer. A name may occur once in each view of the file.
     """
-    colours = (
-        layer for layer in layers if {"R", "G", "B"} <= layer.channels.keys() and layer.channels["R"].type != "uint"
-    )
-    names = {layer.name for layer in colours if not is_known(layer.name)}
+    colours = (layer for layer in layers if {"R", "G", "B"} <= layer.channels.keys())
+    names = {layer.name for layer in colours if layer.channels["R"].type != "uint" and not is_known(layer.name)}
     return list(names) if len(names) == 1 else []
 
 

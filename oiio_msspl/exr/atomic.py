@@ -117,16 +117,9 @@ def replacing(
 ) -> Iterator[Path]:
     """Give the ``with`` block a temporary file, and rename it to ``path`` when the block ends.
 
-    If the block raises, the temporary file is deleted and ``path`` stays as it was. If ``path`` is a link, the file
-    that it points to is replaced. A replaced file keeps its permissions.
-
-    Args:
-        path: the file to write.
-        overwrite: replace an existing file.
-        before_rename: called when the temporary file is complete. If it raises, ``path`` stays as it was.
-
-    Yields:
-        The path of the temporary file, in the same folder.
+    The temporary file is in the same folder. If the block raises, it is deleted, and ``path`` stays as it was; so too
+    if ``before_rename`` raises, which is called when the file is complete. If ``path`` is a link, the file that it
+    points to is replaced. A file that exists is only replaced with ``overwrite``, and keeps its permissions.
 
     Raises:
         InputError: without ``overwrite``, a file has appeared at ``path`` meanwhile.

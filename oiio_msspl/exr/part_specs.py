@@ -101,7 +101,10 @@ def _named_parts(contents: FileContents) -> Iterator[tuple[str, _NameOrigin, Pas
             continue
         if _stays_whole(part, contents):
             origin = _NameOrigin.PART if part.name else _NameOrigin.MADE_UP
-            yield part.name or f"part{part.index}", origin, _whole_part(part)
+            spec = _copied(part)
+            spec.channelnames = tuple(channel.name for channel in part.channels)
+            whole = PassedOnPart(spec, part, (part.channels,) if _has_one_type(part) else None)
+            yield part.name or f"part{part.index}", origin, whole
             continue
         groups: dict[tuple[str, str, str], list[Channel]] = {}
         for channel in part.channels:
@@ -141,14 +144,6 @@ def is_held_whole(part: Part, contents: FileContents) -> bool:
 
 def _has_one_type(part: Part) -> bool:
     return len({channel.type for channel in part.channels}) == 1
-
-
-def _whole_part(part: Part) -> PassedOnPart:
-    spec = oiio.ImageSpec(part.spec)
-    spec.channelnames = tuple(channel.name for channel in part.channels)
-    spec.tile_width = spec.tile_height = spec.tile_depth = 0
-    _drop_structure(spec, lossless(part))
-    return PassedOnPart(spec, part, (part.channels,) if _has_one_type(part) else None)
 
 
 def _layer_name(
@@ -213,13 +208,11 @@ def _unique(name: str, taken: set[str], reserved: Collection[str] = ()) -> str:
 
 def _spec(part: Part, name: str, channels: list[str], kind: str, view: str) -> Any:
     """Describe a part of scan lines with channels of one view, with the windows and metadata of ``part``."""
-    spec = oiio.ImageSpec(part.spec)
-    spec.tile_width = spec.tile_height = spec.tile_depth = 0
+    spec = _copied(part)
     spec.nchannels = len(channels)
     spec.channelnames = tuple(channels)
     spec.channelformats = ()
     spec.format = oiio.TypeDesc(kind)
-    _drop_structure(spec, lossless(part))
     _set_name(spec, name)
     spec.erase_attribute("multiView")  # it names the views of a part that has several
     if view:
@@ -235,10 +228,14 @@ def _drop_repeated_attributes(spec: Any) -> None:
             spec.erase_attribute(name)
 
 
-def _drop_structure(spec: Any, compression: str) -> None:
+def _copied(part: Part) -> Any:
+    """Describe a part of scan lines with all channels, windows and metadata of ``part``."""
+    spec = oiio.ImageSpec(part.spec)
+    spec.tile_width = spec.tile_height = spec.tile_depth = 0
     for attribute in _STRUCTURE:
         spec.erase_attribute(attribute)
-    _compress(spec, compression)
+    _compress(spec, lossless(part))
+    return spec
 
 
 def _set_name(spec: Any, name: str) -> None:

@@ -68,13 +68,11 @@ def write_preview(
     """Write an sRGB PNG of the frame, atomically. Pixels outside the data window are black.
 
     Args:
-        path: the PNG to write.
         rgb: scene linear, (height, width, 3), over ``data_window``.
         data_window, display_window: the pixels that ``rgb`` covers, and the frame, which the PNG shows.
         view: None for the paper's sRGB curve; otherwise a view of OpenColorIO's built-in CG configuration, e.g.
             ``Un-tone-mapped`` or ``ACES 1.0 - SDR Video``.
         space: linear RGB space of ``rgb``; converted to Rec. 709 for the picture.
-        overwrite: replace an existing file.
 
     Raises:
         InputError: the view is unknown, or ``path`` exists.

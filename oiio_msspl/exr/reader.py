@@ -45,7 +45,6 @@ class Channel:
     """One channel of one part of one file."""
 
     path: Path
-    """The file."""
     part: int
     """Index of the part in the file."""
     index: int
@@ -174,7 +173,6 @@ class ExrFile:
         """Yield all rows of neighbouring channels in their stored pixel type, to be copied bit for bit.
 
         Args:
-            part: the part that holds the channels.
             first, last: indices of the first channel and of the one after the last. All have one pixel type.
             later: more such ranges, which later calls read inside of one :meth:`cache_strips`. Those of this pixel type
                 are decoded together with this range and kept until they are read; those that do not fit into the
@@ -273,7 +271,16 @@ def open_exr(path: str | Path) -> ExrFile:
     """
     path = Path(path)
     check_encodable(path)
-    handle = _open(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file in it")
+    if not path.is_file():
+        raise InputError(f"{path}: {'is no ordinary file' if path.exists() else 'no such file'}")
+    handle = oiio.ImageInput.open(str(path))
+    if handle is None:
+        raise _refused(path, reason_of(oiio))
+    if handle.format_name() != "openexr":
+        kind = handle.format_name()
+        raise InputError(f"{path}: is a {kind} file; give an EXR, other formats lose what the network needs")
     parts: list[Part] = []
     metadata: dict[str, Any] = {}
     while handle.seek_subimage(len(parts), 0):
@@ -285,24 +292,8 @@ def open_exr(path: str | Path) -> ExrFile:
     if not parts:
         raise InputError(f"{path}: holds no image")
     first = parts[0].spec
-    x, y = first.full_x, first.full_y
-    frame = Window(x, y, x + first.full_width, y + first.full_height)
+    frame = Window(0, 0, first.full_width, first.full_height).shift(first.full_x, first.full_y)
     return ExrFile(path, tuple(parts), frame, float(metadata.get("PixelAspectRatio", 1.0)), metadata)
-
-
-def _open(path: Path) -> Any:
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; name a file in it")
-    if not path.is_file():
-        raise InputError(f"{path}: {'is no ordinary file' if path.exists() else 'no such file'}")
-    handle = oiio.ImageInput.open(str(path))
-    if handle is None:
-        raise _refused(path, reason_of(oiio))
-    if handle.format_name() != "openexr":
-        raise InputError(
-            f"{path}: is a {handle.format_name()} file; give an EXR, other formats lose what the network needs"
-        )
-    return handle
 
 
 def _refused(path: Path, reason: str) -> InputError:
@@ -318,7 +309,7 @@ def _part(path: Path, index: int, spec: Any) -> Part:
         name=_text(str(spec.getattribute("oiio:subimagename") or "")),
         view=_text(str(spec.getattribute("view") or "")),
         channels=tuple(Channel(path, index, i, name, kind) for i, (name, kind) in named),
-        data_window=Window(spec.x, spec.y, spec.x + spec.width, spec.y + spec.height),
+        data_window=Window(0, 0, spec.width, spec.height).shift(spec.x, spec.y),
         compression=str(spec.getattribute("compression") or "none").split(":")[0],
         tile=(spec.tile_width, spec.tile_height),
         deep=bool(spec.deep),

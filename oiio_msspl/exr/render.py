@@ -84,11 +84,7 @@ class Render:
 
     @classmethod
     def from_arrays(cls, name: str = "render", **layers: Array) -> Render:
-        """Make a render without overscan from arrays.
-
-        Args:
-            name: for messages.
-            layers: float (height, width, channels), of those in ``CHANNELS``.
+        """Make a render without overscan from arrays: floats (height, width, channels), of those in ``CHANNELS``.
 
         Raises:
             ValueError: ``rgb`` is missing, a name is unknown, sizes differ or are 0, a layer has the wrong number of
@@ -153,11 +149,8 @@ class ReadableRender(Protocol):
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
         """Return features over a rectangle, float32 (height, width, channels) each; 0 outside of the data window.
 
-        Values are as stored: NaN and infinities may be among them.
-
-        Args:
-            window: the rectangle.
-            features: names of features; all if None. Those that the render lacks are left out.
+        Values are as stored: NaN and infinities may be among them. ``features`` are names of features, all if None;
+        those that the render lacks are left out.
         """
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:

@@ -87,14 +87,14 @@ def channel_names(contents: FileContents) -> dict[Channel, str]:
     Raises:
         InputError: parts have different data windows, or two channels would have one name.
     """
-    path, home = contents.source.path, contents.home
+    path, window = contents.source.path, contents.home.data_window
     taken = {channel.name for channel in contents.beauty}
     names: dict[Channel, str] = {}
     for part, passed_on in _passed_on(contents):
-        if part.data_window != home.data_window:
+        if part.data_window != window:
             raise InputError(
                 f"--layout multilayer: part '{part.name}' of {path} has the data window {part.data_window}, "
-                f"the beauty has {home.data_window}; one part can hold only one, use --layout spec"
+                f"the beauty has {window}; one part can hold only one, use --layout spec"
             )
         for channel in passed_on:
             name = names[channel] = _name(contents, channel)

@@ -58,18 +58,15 @@ def write_fused(
     """Write the fused frame to ``path``, atomically.
 
     Args:
-        path: the EXR to write.
         source: the HRLS, whose layers are passed on.
         beauty: channels R, G, B and perhaps A of the HRLS, which the fused frame replaces.
         rgb: scene linear, (height, width, 3), over the beauty's data window.
         alpha: (height, width, 1) if ``beauty`` has an A, otherwise None.
         attributes, replaced: see :class:`FileContents`.
-        options: layout, compression, pixel type and layers.
         extra: further layers, such as ``error``, see :attr:`FusedPixels.extra`.
-        overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit waits in temporary
             files.
-        before_rename: called just before the EXR gets its name, see :func:`oiio_msspl.exr.atomic.replacing`.
+        overwrite, before_rename: see :func:`oiio_msspl.exr.atomic.replacing`.
 
     Returns:
         Warnings, one sentence each.
@@ -79,15 +76,17 @@ def write_fused(
         MssplError: the file can't be written; a file at ``path`` is untouched.
     """
     dropped = dropped_channels(source, beauty, options.layers)
-    warnings: list[Finding] = [
-        Finding("deep", f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on")
-        for part in source.parts
-        if part.deep
-    ]
+    deep = [f"part {part.index} ({part.name or 'unnamed'})" for part in source.parts if part.deep]
+    warnings = [Finding("deep", f"{part} is deep and was not passed on") for part in deep]
     colour = without_alpha_apart(beauty)
     if len(colour) < len(beauty) and alpha is not None:
-        replaced = replaced or ReplacedChannels()
-        warnings += _replace_alpha(replaced, source, beauty, alpha)
+        if source.parts[beauty[-1].part].data_window == source.parts[beauty[0].part].data_window:
+            replaced = replaced or ReplacedChannels()
+            replaced.add(beauty[-1:], alpha.shape[1], alpha.shape[0])
+            replaced.put(beauty[-1], 0, alpha[..., 0])
+        else:
+            text = "the alpha has another data window than the beauty, so it is passed on as it is"
+            warnings.append(Finding("no_alpha", text))
         alpha = None
     pixels = FusedPixels(rgb, alpha, extra, stored_type(beauty, options))
     contents = FileContents(source, colour, dropped, pixels, attributes, options, replaced)
@@ -100,19 +99,6 @@ def write_fused(
     return warnings
 
 
-def _replace_alpha(
-    replaced: ReplacedChannels, source: ExrFile, beauty: Sequence[Channel], alpha: Array
-) -> list[Finding]:
-    """Put the alpha of another part where it was. Return a warning if that part has another data window."""
-    channel = beauty[-1]
-    if source.parts[channel.part].data_window != source.parts[beauty[0].part].data_window:
-        text = "the alpha has another data window than the beauty, so it is passed on as it is"
-        return [Finding("no_alpha", text)]
-    replaced.add([channel], alpha.shape[1], alpha.shape[0])
-    replaced.put(channel, 0, alpha[..., 0])
-    return []
-
-
 def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str]) -> None:
     """Check by the headers alone that the layout can hold what :func:`write_fused` would write.
 
@@ -122,12 +108,11 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
     """
     contents = _without_pixels(source, beauty, options, extra)
     kept = {layer.name for channel, layer in contents.layers.items() if channel not in contents.dropped}
-    for name in contents.pixels.extra:
-        if name in kept:
-            raise InputError(
-                f"{OPTIONS[name]}: {source.path} has a layer '{name}' of its own; choose other layers with --layers, "
-                "or leave the option out"
-            )
+    if name := next((name for name in contents.pixels.extra if name in kept), None):
+        raise InputError(
+            f"{OPTIONS[name]}: {source.path} has a layer '{name}' of its own; choose other layers with --layers, "
+            "or leave the option out"
+        )
     if options.layout == "multilayer":
         channel_names(contents)
 

@@ -50,7 +50,7 @@ class PairCheck:
 
     @property
     def codes(self) -> set[str]:
-        """The codes of all warnings, see :data:`oiio_msspl.findings.CODES`, and of the advice."""
+        """The codes of all warnings, see ``docs/api.md``, and of the advice."""
         return {*codes_of(self.warnings), *codes_of(self.advice)}
 
     def as_dict(self) -> dict[str, Any]:

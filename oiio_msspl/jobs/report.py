@@ -54,7 +54,7 @@ class FrameReport:
     negative: dict[str, int]
     """Number of values that were negative and set to 0, by layer."""
     warnings: list[Finding]
-    """What is wrong with the frame. Each is a sentence with a ``code``, see :data:`oiio_msspl.findings.CODES`."""
+    """What is wrong with the frame. Each is a sentence with a ``code``, see ``docs/api.md``."""
     tiles: int
     """Tiles of all views that were fused."""
     seconds: dict[str, float]

@@ -55,7 +55,7 @@ class FrameResult:
     exit_code: int = 0
     """0, 2 for the caller's mistake, or 1 for any other failure."""
     warnings: list[Finding] = field(default_factory=list)
-    """What is wrong with it. Each is a sentence with a ``code``, see :data:`oiio_msspl.findings.CODES`."""
+    """What is wrong with it. Each is a sentence with a ``code``, see ``docs/api.md``."""
     aovs: list[dict[str, str]] = field(default_factory=list)
     """What the features of the HRLS were read from: ``feature``, ``status``, ``source`` and ``note``."""
     layers: list[str] = field(default_factory=list)
@@ -108,7 +108,7 @@ class ShotReport:
 
     @property
     def codes(self) -> set[str]:
-        """The codes of all warnings, about the shot and about its frames, see :data:`oiio_msspl.findings.CODES`."""
+        """The codes of all warnings, about the shot and about its frames, see ``docs/api.md``."""
         return {code for result in self.results.values() for code in result.codes}.union(codes_of(self.warnings))
 
     @property

@@ -97,28 +97,20 @@ class Contract:
 
     def _wrong_field(self) -> str | None:
         """Return the name of a field whose value has a wrong type or is out of range; None if all are valid."""
-        numbers = {"scale": (1, 64), "alignment": (1, 1024), "overlap": (0, 4096), "bytes_per_pixel": (1, 10**6)}
-        for name, (least, most) in numbers.items():
-            value = getattr(self, name)
-            if type(value) is not int or not least <= value <= most:
-                return name
-        if not isinstance(self.name, str) or not 0 < len(self.name) <= 100:
-            return "name"
+        bounds = {"scale": (1, 64), "alignment": (1, 1024), "overlap": (0, 4096), "bytes_per_pixel": (1, 10**6)}
+        numbers = {name: (getattr(self, name), *span) for name, span in bounds.items()}
+        valid = {name: type(n) is int and least <= n <= most for name, (n, least, most) in numbers.items()}
+        valid["name"] = isinstance(self.name, str) and 0 < len(self.name) <= 100
         for render in ("lrhs", "hrls"):
-            features = getattr(self, render)
-            valid = isinstance(features, list) and all(isinstance(name, str) and name in FEATURES for name in features)
-            if not valid or features[:1] != [RGB]:
-                return render
-        if self.denoiser not in (NO_DENOISER, *DENOISERS):
-            return "denoiser"
-        if not isinstance(self.provenance, dict):
-            return "provenance"
-        spans = self.training_spp
-        is_span = isinstance(spans, dict) and all(
+            names = getattr(self, render)
+            valid[render] = isinstance(names, list) and names[:1] == [RGB] and all(name in FEATURES for name in names)
+        valid["denoiser"] = self.denoiser in (NO_DENOISER, *DENOISERS)
+        valid["provenance"] = isinstance(self.provenance, dict)
+        valid["training_spp"] = isinstance(self.training_spp, dict) and all(
             isinstance(span, list) and len(span) == 2 and all(type(spp) in (int, float) for spp in span)
-            for span in spans.values()
+            for span in self.training_spp.values()
         )
-        return None if is_span else "training_spp"
+        return next((name for name, is_valid in valid.items() if not is_valid), None)
 
     def to_json(self) -> str:
         return json.dumps(asdict(self), sort_keys=True)

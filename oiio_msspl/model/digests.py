@@ -14,8 +14,7 @@ from oiio_msspl.model.devices import file_for
 def digest(path: Path) -> str:
     """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the weights files it names.
 
-    Args:
-        path: the ONNX file. Its weights files, ``*.weights``, lie beside it and are read in the order of their names.
+    The weights files, ``*.weights``, lie beside the ONNX file and are read in the order of their names.
 
     Raises:
         FileNotFoundError: the ONNX file or one of its weights files is missing.
@@ -28,12 +27,7 @@ def digest(path: Path) -> str:
 
 
 def digests(models: Iterable[Path], device: str) -> dict[str, str]:
-    """Return the digest of each model's file for a device, by the model's name.
-
-    Args:
-        models: the files for CPUs.
-        device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
-    """
+    """Return the digest of each model's file for a device, by the model's name; ``models`` are the files for CPUs."""
     return {path.stem: digest(file_for(path, device)) for path in models}
 
 

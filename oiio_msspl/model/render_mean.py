@@ -37,7 +37,6 @@ def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float, share: 
     Args:
         pairs: features of the LRHS and of the HRLS for parts of the frame, all equally large: ``rgb``, and ``albedo``
             and ``normal`` of the renders that have them.
-        exposure: of the frame.
         share: of ``rgb``, if it is known.
 
     Returns:

@@ -48,7 +48,6 @@ def load_network(
     """Load an ONNX file, or raise InputError.
 
     Args:
-        path: the file.
         threads: CPU threads; 0 for one a core.
         providers: each operator goes to the first one that supports it.
         optimise: transform the graph for speed. False loads faster, for a network that does not run.

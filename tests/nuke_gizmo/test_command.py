@@ -7,8 +7,8 @@ import subprocess
 import sys
 
 import pytest
+from msspl_bridge import FuseError
 from msspl_bridge.command import Settings, build_command, clean_environment, find_program
-from msspl_bridge.errors import FuseError
 from msspl_bridge.frame_files import FrameFile
 
 

@@ -2,7 +2,7 @@
 """File names of numbered frames."""
 
 import pytest
-from msspl_bridge.errors import FuseError
+from msspl_bridge import FuseError
 from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output, parse_range
 
 

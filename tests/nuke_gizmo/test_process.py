@@ -9,9 +9,8 @@ import time
 from pathlib import Path
 
 import pytest
-from msspl_bridge import process
+from msspl_bridge import FuseError, process
 from msspl_bridge.command import clean_environment
-from msspl_bridge.errors import FuseError
 from msspl_cli.commands.nuke_install import find_msspl_fuse
 
 

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from msspl_bridge.errors import FuseError
+from msspl_bridge import FuseError
 from msspl_bridge.passes import FusedSet, fused_sets
 
 from oiio_msspl.exr.layers import layers_of

@@ -58,7 +58,7 @@ def compare(
     with several views, the first view of the first image is compared.
     """
     from oiio_msspl.compare import (
-        check_error_map,
+        check_output,
         note_on_spaces,
         note_on_views,
         note_on_weights,
@@ -68,7 +68,7 @@ def compare(
         score_images,
         write_error_map,
     )
-    from oiio_msspl.compare_page import check_layers, check_page
+    from oiio_msspl.compare_page import check_layers
 
     if reference is None and (html is None or error_map is not None):
         raise InputError("scores and error maps need --reference; without one, --html writes a page to look at")
@@ -76,9 +76,9 @@ def compare(
         raise InputError("--layers chooses the layers of the page; add --html PAGE")
     compared = [*images, reference] if reference else images
     if error_map is not None:
-        check_error_map(error_map, compared, overwrite=overwrite)
+        check_output(error_map, "the error map is a PNG", (".png",), compared, overwrite=overwrite)
     if html is not None:
-        check_page(html, compared, overwrite=overwrite)
+        check_output(html, "the page is HTML", (".html", ".htm"), compared, overwrite=overwrite)
     comparison = open_comparison(images, reference, _layer(mapping))
     if html is not None:
         check_layers(comparison, layers)
@@ -125,13 +125,12 @@ def _write_page(html: Path, comparison: Comparison, layers: list[str], overwrite
     from oiio_msspl.compare_page import write_page
 
     with console.ProgressBar() as bar:
-        page = write_page(
+        size, names = write_page(
             html,
             comparison,
             layers=layers,
             overwrite=overwrite,
             progress=lambda done, total: bar.update("writing layers", done, total),
         )
-    size = f"{page.size / 1e6:.1f} MB"
-    advice = "; choose fewer layers with --layers to make it smaller" if page.size > LARGE_PAGE else ""
-    return f"Wrote {html}: {size}, layers: {', '.join(page.layers)}{advice}"
+    advice = "; choose fewer layers with --layers to make it smaller" if size > LARGE_PAGE else ""
+    return f"Wrote {html}: {size / 1e6:.1f} MB, layers: {', '.join(names)}{advice}"

@@ -100,11 +100,10 @@ def without_vectors(sequence: Sequence, folder: Path) -> Sequence:
 
 
 def write_one_render(sequence: Sequence, number: int, path: Path) -> None:
-    """Write the full-resolution render of a frame, with the motion vectors of its HRLS."""
+    """Write the full-resolution render of a frame, with the layers of its HRLS that it lacks, such as motion vectors."""
     files = [str(sequence.folder / f"{kind}.{number:04d}.exr") for kind in ("full", "hr")]
     with OpenEXR.File(files[0], separate_channels=True) as full, OpenEXR.File(files[1], separate_channels=True) as hr:
-        channels = hr.channels() | full.channels()
-        pixels = {name: channel.pixels for name, channel in channels.items() if name in {*full.channels(), *MOTION}}
+        pixels = {name: channel.pixels for name, channel in (hr.channels() | full.channels()).items()}
         with OpenEXR.File(full.header(), pixels) as written:
             written.write(str(path))
 

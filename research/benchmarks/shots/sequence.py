@@ -100,7 +100,7 @@ def without_vectors(sequence: Sequence, folder: Path) -> Sequence:
 
 
 def write_one_render(sequence: Sequence, number: int, path: Path) -> None:
-    """Write the full-resolution render of a frame, with the layers of its HRLS that it lacks, such as motion vectors."""
+    """Write the full-resolution render of a frame, with the layers of its HRLS that it lacks, such as vectors."""
     files = [str(sequence.folder / f"{kind}.{number:04d}.exr") for kind in ("full", "hr")]
     with OpenEXR.File(files[0], separate_channels=True) as full, OpenEXR.File(files[1], separate_channels=True) as hr:
         pixels = {name: channel.pixels for name, channel in (hr.channels() | full.channels()).items()}

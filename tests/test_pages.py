@@ -209,12 +209,12 @@ def check_arguments(program: str, arguments: list[str], monkeypatch: pytest.Monk
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
     monkeypatch.setattr(sys, "argv", [program, *arguments])
+    for renderer in ("bpy", "bmesh", "mathutils"):  # imported before the arguments are read
+        monkeypatch.setitem(sys.modules, renderer, MagicMock(**{"app.version": (5, 0, 0)}))
     with pytest.raises(Accepted):
         if not program.endswith(".py"):
             runpy.run_module(program, run_name="__main__", alter_sys=True)
         else:
-            for renderer in ("bpy", "mathutils"):  # imported before the arguments are read
-                monkeypatch.setitem(sys.modules, renderer, MagicMock(**{"app.version": (5, 0, 0)}))
             runpy.run_path(str(ROOT / program), run_name="__main__")
 
 

@@ -76,8 +76,11 @@ def write_fused(
         MssplError: the file can't be written; a file at ``path`` is untouched.
     """
     dropped = dropped_channels(source, beauty, options.layers)
-    deep = [f"part {part.index} ({part.name or 'unnamed'})" for part in source.parts if part.deep]
-    warnings = [Finding("deep", f"{part} is deep and was not passed on") for part in deep]
+    warnings = [
+        Finding("deep", f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on")
+        for part in source.parts
+        if part.deep
+    ]
     colour = without_alpha_apart(beauty)
     if len(colour) < len(beauty) and alpha is not None:
         if source.parts[beauty[-1].part].data_window == source.parts[beauty[0].part].data_window:

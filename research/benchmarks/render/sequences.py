@@ -47,8 +47,8 @@ WIDTH, HEIGHT, LONGER = 320, 224, 1024
 #: depth.
 PAN, TRUCK = 0.9, 0.8
 MAX_DEPTH = 8
-#: spp of each half of the reference. Their noise cancels in the product of both errors.
-REFERENCE_HALF = 24
+#: spp of each half of the reference. The noise of fewer shifts sRGB values of dark rooms: with 24, PSNR falls by 1 dB.
+REFERENCE_HALF = 48
 #: Samples that are rendered at once; more need more memory.
 LAUNCH = 2_000_000
 

@@ -7,6 +7,8 @@ leaves their noise in. So such pixels become those that the frame has without ne
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from oiio_msspl.exr.render import Window
@@ -15,7 +17,6 @@ from oiio_msspl.fusion.neighbours.bands import for_bands, to_grid
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
 from oiio_msspl.fusion.tiles.prepare import FramePair
-from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.arrays import Array, Mask, blank, unload
 from oiio_msspl.image.filters import all_within, grown
 from oiio_msspl.image.parallel import limit_threads
@@ -61,7 +62,10 @@ def fuse_alone(
         error: Array | None = None if frame.error is None else blank(frame.error.shape)
         result = FusedPixels(blank(frame.rgb.shape), None, error, alignment, own.exposure)
         result.trust = None if frame.trust is None else frame.trust.copy()
-        for task in fuse_tiles(tile_tasks(own, result, tiles=_tiles(own, places, alignment.grid)), session):
+        # Tiles begin at multiples of the contract's alignment, which is no more than the overlap: none meets another.
+        boxes = _boxes(places, 2 * session.contract.overlap)
+        tiles = [tile for box in boxes for tile in own.tiles(box.shift(alignment.grid.x0, alignment.grid.y0))]
+        for task in fuse_tiles(tile_tasks(own, result, tiles=tiles), session):
             target = task.tile.features.hrls_target.slices(window)
             weight = _alone(counts[target])
             for image, new in ((frame.rgb, result.rgb), (frame.alpha, result.alpha), (frame.error, result.error)):
@@ -81,13 +85,15 @@ def _alone(frames: Array) -> Array:
     return np.clip((AVERAGED - frames) / np.float32(AVERAGED - ALONE), 0, 1)
 
 
-def _tiles(own: FramePair, places: Mask, grid: Window) -> list[Tile]:
-    """Return the tiles that cover all places (h, w) of a grid: each tile of the frame without its empty margins."""
-    tiles = []
-    for whole in own.tiles():
-        core = whole.core.intersect(grid)
-        rows, columns = (np.flatnonzero(places[core.slices(grid)].any(axis=axis)) for axis in (1, 0))
-        if len(rows):
-            part = Window(columns[0], rows[0], columns[-1] + 1, rows[-1] + 1).shift(core.x0, core.y0)
-            tiles += own.tiles(part)
-    return tiles
+def _boxes(places: Mask, gap: int) -> Iterator[Window]:
+    """Yield boxes that hold all places (h, w). More than ``gap`` rows or columns lie between two of them."""
+    rows, columns = (np.flatnonzero(places.any(axis=axis)) for axis in (1, 0))
+    for axis, used in enumerate((rows, columns)):
+        starts = used[1:][np.diff(used) > gap]
+        if len(starts):
+            before, after = np.split(places, starts[:1], axis)
+            yield from _boxes(before, gap)
+            dx, dy = (0, starts[0]) if axis == 0 else (starts[0], 0)
+            yield from (box.shift(dx, dy) for box in _boxes(after, gap))
+            return
+    yield Window(columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)

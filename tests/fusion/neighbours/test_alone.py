@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands alone among averages of frames has the pixels that it would have without neighbours."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.fuse import fuse
-from oiio_msspl.fusion.neighbours.alone import fuse_alone
+from oiio_msspl.fusion.neighbours.alone import _boxes, fuse_alone
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import find_model
@@ -63,3 +65,21 @@ def test_single_pixels_and_whole_frames_that_stand_alone_are_not_fused_again(mon
     frame.frames = None
     fuse_alone(pair, frame, session)
     assert not runs
+
+
+def test_boxes_hold_all_places_and_lie_apart():
+    rng = np.random.default_rng(3)
+    places = np.zeros((300, 500), bool)
+    for y, x in zip(rng.integers(0, 290, 12), rng.integers(0, 490, 12), strict=True):
+        places[y : y + 7, x : x + 5] = True
+    boxes = list(_boxes(places, gap=20))
+    held = np.zeros_like(places)
+    for box in boxes:
+        assert places[box.y0 : box.y1, box.x0 : box.x1].any()
+        held[box.y0 : box.y1, box.x0 : box.x1] = True
+    assert (held >= places).all()
+    assert len(boxes) > 6
+    for first, second in itertools.combinations(boxes, 2):
+        columns = max(first.x0, second.x0) - min(first.x1, second.x1)
+        rows = max(first.y0, second.y0) - min(first.y1, second.y1)
+        assert max(columns, rows) > 20

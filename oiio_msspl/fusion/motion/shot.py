@@ -11,12 +11,17 @@ import numpy as np
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.motion.source import FLOW, STATIC, VECTORS, MotionFrame, MotionSource
+from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.image.arrays import Array, Mask, kept
+from oiio_msspl.image.filters import grown
 from oiio_msspl.image.sampling import nearest_indices
 
 #: A vector and the way back may differ by this, in HRLS pixels: by rounding, and by what vectors change within a pixel.
 #: Vectors of optical flow are estimates, so more is allowed.
 ROUND_TRIP, ROUND_TRIP_OF_FLOW = 0.25, 1.0
+#: Pixels this near to a border of two surfaces, by their vectors, are not taken for an object that has moved: they mix
+#: both, and which one a pixel shows changes by rounding.
+BESIDE_BORDERS = 2
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,7 @@ class ShotMotion:
         if objects is not None and source.kind == VECTORS:
             # Pixels are followed there and back, so one direction tells both. Where the way back leads elsewhere, the
             # surface is only hidden.
+            objects &= ~grown(near_borders(forth, ROUND_TRIP), BESIDE_BORDERS)
             hidden = objects & ~_leads_back(objects, forth, back, first.hr.data_window, second.hr.data_window)
             return self._motion(forth, known & ~hidden, objects & ~hidden), self._motion(back, back_known, None)
         there = self._motion(forth, known, objects)

@@ -135,12 +135,33 @@ def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mas
         for name, image in here.items():
             one, two = (np.nan_to_num(planes_of(x[around]), posinf=0, neginf=0) for x in (image, there[name]))
             limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + np.float32(DIFFERENCE)
-            differs = (_distance(one, two) > limit) & compared[around]
+            differs = _show_another(one, two, limit, (_distance(one, two) > limit) & compared[around])
             other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
         other |= means_around(other.astype(np.float32), [AROUND])[0] > MOST
         result[rows] = grown(other)[first - around.start :][: last - first]
 
     for_row_blocks(work, height, width)
+    return result
+
+
+def _show_another(one: Array, two: Array, limit: Array, differs: Mask) -> Mask:
+    """Find which pixels that differ (h, w) show what is in neither of the 3 x 3 pixels around them in the other frame.
+
+    At the edge of two surfaces a pixel with few samples shows the one or the other by chance.
+    """
+    y, x = np.nonzero(differs)
+    height, width = differs.shape
+    places = [
+        (np.clip(y + row, 0, height - 1), np.clip(x + column, 0, width - 1))
+        for row, column in itertools.product((-1, 0, 1), repeat=2)
+    ]
+    outside = np.zeros((2, len(y)), np.float32)
+    for a, b in zip(one, two, strict=True):
+        for total, pixel, other in ((outside[0], a, b), (outside[1], b, a)):
+            around = np.stack([other[place] for place in places])
+            total += np.square(pixel[y, x] - np.clip(pixel[y, x], around.min(axis=0), around.max(axis=0)))
+    result = np.zeros_like(differs)
+    result[y, x] = np.sqrt(outside.max(axis=0)) > limit[y, x]
     return result
 
 

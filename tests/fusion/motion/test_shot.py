@@ -99,3 +99,18 @@ def test_objects_that_vectors_mislead_are_not_known_and_hidden_ones_are_not_obje
     misled[4, 6] = True
     assert (there.moved_objects == misled).all() and (there.known == ~objects).all()
     assert back.known is None and back.moved_objects is None
+
+
+def test_what_differs_beside_a_border_of_vectors_is_no_object():
+    objects = np.zeros((10, 20), bool)
+    objects[:, 9] = objects[:, 16] = True
+
+    class Border(Source):
+        def read(self, frame, neighbour, hop):
+            vectors = np.zeros((*objects.shape, 2), np.float32)
+            vectors[:, :8] = 0.3 * hop
+            return vectors, np.ones(objects.shape, bool)
+
+    there, _ = ShotMotion(Border(objects=objects.copy())).between(frame(1), frame(2))
+    assert there.moved_objects[:, 16].all() and not there.moved_objects[:, :16].any()
+    assert (there.known == ~there.moved_objects).all()

@@ -30,3 +30,14 @@ def test_most_squares_that_have_the_same_colour_by_chance_are_another_surface():
 
 def test_an_object_that_is_followed_is_the_same_surface():
     assert not found([12, 0])[32:64, 32:64].any()
+
+
+def test_a_blurred_edge_with_few_samples_is_no_other_surface():
+    covered = np.clip(np.linspace(-2, 3, SIZE, dtype=np.float32), 0, 1)
+    renders = []
+    for seed in (1, 2):
+        shown = np.random.default_rng(seed).random((SIZE, SIZE)) < covered  # one sample a pixel
+        albedo = np.where(shown[..., None], np.float32(0.8), np.float32(0.2)).repeat(3, axis=2)
+        renders.append(Render.from_arrays("frame", rgb=albedo, albedo=albedo))
+    vectors = np.zeros((SIZE, SIZE, 2), np.float32)
+    assert other_surfaces(*renders, ["albedo"], vectors, np.ones((SIZE, SIZE), bool)).mean() < 0.002

@@ -39,6 +39,9 @@ PIXELS_AVERAGED = 80.0
 #: A change is certain from this many standard deviations of the mean of products on. From the second number on, a small
 #: square contradicts what the large ones around it say.
 CERTAIN, CONTRADICTED = 2.0, 4.0
+#: A neighbour counts half where the light's squared change is this many times the squared error that the frame's result
+#: has anyway. A smaller change adds less error than the neighbour takes away; a larger one is seen.
+TOLERATED = 2.5
 #: Before differences are averaged to larger cells, they are limited to this many standard deviations of one of them: a
 #: highlight that moves says nothing of the surface around it.
 MOST_SAID = np.float32(3.0)
@@ -240,9 +243,8 @@ class _Cells:
         means = means_around((self.low * self.high).mean(axis=-1), REACHES)
         for reach, mean in zip(REACHES, means, strict=True):
             one = self.deviation / np.float32(2 * reach + 1)
-            # Squared, because all neighbours may show the same other light.
             least, most = (
-                np.square(own_error / np.maximum(change, own_error))
+                1 / (1 + np.square(np.square(np.maximum(change, 0) / (np.float32(TOLERATED) * own_error))))
                 for change in (mean + np.float32(CONTRADICTED) * one, mean - np.float32(CERTAIN) * one)
             )
             trust = np.clip(trust, least, most)

@@ -14,6 +14,8 @@ PASSES is made by :mod:`research.benchmarks.render.passes` and ``research.datage
 - "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
 - "msspl, best, at half size": light groups at half of the frame's resolution, as if there were many of them.
 
+At a scale of 1, "msspl" fuses the ordinary render alone.
+
 Light and colour that are stored apart are multiplied first. A layer with less than `FAINT` of the beauty's light is
 part of the sum, but is not scored: every method has a high PSNR there.
 
@@ -41,15 +43,18 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import layer_names, light_of
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.metrics import psnr, relmse
+from oiio_msspl.jobs.settings import family_for_noise
 from oiio_msspl.model.catalogue import load_model
+from oiio_msspl.model.contract import ONE_SIZE
 from research.benchmarks import results, timer
 from research.benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
 from research.benchmarks.results import MEAN, Row
 
-SCALES, SPP = (2, 4), (1, 2)
+SCALES, SPP = (2, 4, ONE_SIZE), (1, 2)
 KEYS = ("scene", "set", "spp", "method")
 #: Calls of OIDN before the one that is the unit of time: the first one loads its network.
 WARM_UP = 2
@@ -136,7 +141,10 @@ def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
 
 def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, tuple[FusedFrame, Session]]:
     """Return the fused frame of each model, and the model. That of single layers is loaded, too."""
-    sessions = {model: load_model(scale, model) for model in (BALANCED, BEST)}
+    alignment = align(lr, hr)
+    sessions = {
+        family: load_model(scale, family_for_noise(family, lr, hr, alignment)[0]) for family in (BALANCED, BEST)
+    }
     sessions[BEST].layer_session  # noqa: B018 - loads it
     return {model: (fuse(lr, hr, session, clean_aovs=True), session) for model, session in sessions.items()}
 
@@ -152,19 +160,28 @@ def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
     return [{"layer": ALL} | {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "relmse")}, *rows]
 
 
-def model_used(method: str, scale: int) -> Row:
+def model_used(method: str, fused: Mapping[str, tuple[FusedFrame, Session]]) -> Row:
     """Return the column ``model`` of a method: the model of its beauty, to which `PEER` is rescaled, too."""
-    if method.startswith("msspl"):
-        return {"model": f"{BEST if 'best' in method else BALANCED}-x{scale}"}
-    return {"model": f"{BEST}-x{scale}"} if method == PEER else {}
+    if method != PEER and not method.startswith("msspl"):
+        return {}
+    _, session = fused[BEST if method == PEER or "best" in method else BALANCED]
+    return {"model": session.name}
 
 
 def measure(folder: Path, scale: int, spp: int, known: Collection[tuple[object, ...]] = ()) -> list[Row]:
     """Measure one scene: rows for each set and method, without those whose `KEYS` are known."""
-    names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
-    lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
-    full = folder / f"hr_{2 * spp}spp.exr"
-    ordinary = map_render(open_exr(full)) if full.exists() else None
+
+    def opened(name: str) -> MappedRender:
+        return map_render(open_exr(folder / f"{name}.exr"))
+
+    reference = opened("ref")
+    ordinary = opened(f"hr_{2 * spp}spp") if (folder / f"hr_{2 * spp}spp.exr").exists() else None
+    if scale > ONE_SIZE:
+        lr, hr = opened(f"lr_x{scale}_{scale**2 * spp}spp"), opened(f"hr_{spp}spp")
+    elif ordinary is not None:
+        lr = hr = ordinary
+    else:
+        return []
     fused = fused_frames(lr, hr, scale)
     pixels = hr.load().layers
     plain = partial(denoise, pixels["rgb"], pixels[ALBEDO], pixels[NORMAL])
@@ -181,7 +198,7 @@ def measure(folder: Path, scale: int, spp: int, known: Collection[tuple[object, 
             made = function()
             seconds = time.perf_counter() - start
             total, *single = scores(made, clean, [layer.name for layer in layers.layers])
-            key |= model_used(name, scale)
+            key |= model_used(name, fused)
             rows += [key | total | {"time": 0.0 if name == "HRLS" else seconds / oidn_seconds}]
             rows += [key | row for row in single]
     return rows

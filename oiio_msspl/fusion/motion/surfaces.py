@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from oiio_msspl.aovs.features import NORMAL
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import grown, means_around, sum_3x3
@@ -21,6 +22,8 @@ from oiio_msspl.image.sampling import nearest_indices
 #: A pixel differs between two frames if a layer has changed by more than a constant and a multiple of the difference of
 #: two pixels of one surface, which is its texture and noise.
 DIFFERENCE, MULTIPLE = 0.03, 3.0
+#: The constant for normals: those of a thing that turns change by up to 6 degrees.
+TURN = 0.1
 #: The surface is another one if this many of 3 x 3 pixels differ. Single ones are noise.
 PIXELS = 4
 #: It is also another one where most pixels differ, up to this number of rows and columns away: a texture that has moved
@@ -134,7 +137,8 @@ def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mas
         other = np.zeros((around.stop - around.start, width), np.bool_)
         for name, image in here.items():
             one, two = (np.nan_to_num(planes_of(x[around]), posinf=0, neginf=0) for x in (image, there[name]))
-            limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + np.float32(DIFFERENCE)
+            least = np.float32(TURN if name == NORMAL else DIFFERENCE)
+            limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + least
             differs = _show_another(one, two, limit, (_distance(one, two) > limit) & compared[around])
             other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
         other |= means_around(other.astype(np.float32), [AROUND])[0] > MOST

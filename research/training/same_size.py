@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the models for one render, and for two renders of one size, out of exported `joint` models at x2.
+"""Make the models for renders of one size, and those for little noise, out of exported `joint` models.
 
     python -m research.training.same_size oiio_msspl/model/weights/joint-x2.onnx
 
 This writes ``joint-x1.onnx`` beside the file for CPUs and, in the folder `gpu`, beside that for GPUs. Nothing is
 trained: the networks and their weights are those of the model at x2, and only what comes before them changes. The mean
-of both renders takes the place of the HRLS, and the mean at half of the size that of the LRHS. With ``--clean``, it
-also writes ``joint-clean-x1.onnx`` for renders with little noise: the denoiser of that mean alone, at full size. That
-of ``joint-large`` reads albedo and normal that are denoised before. Run :mod:`research.training.share` afterwards, so
-that the weights lie once.
+of both renders takes the place of the HRLS, and the mean at half of the size that of the LRHS.
+
+With ``--clean``, it also writes the models for renders with little noise. ``joint-clean-x1.onnx`` is the denoiser of
+that mean alone, at full size. That of ``joint-large`` reads albedo and normal that are denoised before.
+``joint-clean-x2.onnx`` and those at x4 and x8 denoise the HRLS by it, and the mean of both renders at the LRHS's size
+as the models do that they are made of. Then they draw the first picture towards the brightness of the second.
+
+Run :mod:`research.training.share` afterwards, so that the weights lie once.
 """
 
 from __future__ import annotations
@@ -23,13 +27,15 @@ import numpy as np
 import onnx
 import torch
 from onnx import TensorProto, helper
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.model.contract import CLEAN, METADATA_KEY, ONE_SIZE, Contract
+from oiio_msspl.model.contract import CLEAN, METADATA_KEY, ONE_SIZE, SCALES, Contract
 from oiio_msspl.model.devices import gpu_file
-from research.training.ops import box_downsample
+from research.training.encoding import log_decode, log_encode
+from research.training.joint import MAX_RATIO
+from research.training.ops import box_downsample, upsample
 from research.training.quantise.graph import Nodes
 from research.training.render_mean import NOISE_GAIN, Images, mean_of_renders
 from research.training.tracing import traced
@@ -42,6 +48,13 @@ MEAN = ("hrls", "colour", "noise", "albedo", "normal")
 BYTES_PER_PIXEL = 1160
 #: Height and width at x2 of a pixel of the LRHS.
 SCALE = 2
+#: How far the denoised HRLS is drawn towards the brightness of both renders' denoised mean: if no sample of that mean
+#: is the LRHS's, and what is added if all of them are.
+DRAWN, DRAWN_BY_LRHS = 0.2, 0.8
+#: Added to both sides of the ratio of their brightness, in exposed radiance: noise in the dark is no light.
+DARK = 0.02
+#: Prefix of tensors of the denoiser at full size, in the graph of a model for pairs with little noise.
+OWN = "own."
 
 
 class EnterHalves(Enter):
@@ -82,6 +95,26 @@ class EnterMean(Enter):
         return encoded(_mean(lrhs, hrls, shares)), colour, noise, *aovs
 
 
+class Draw(nn.Module):
+    """What comes after the denoisers of a pair with little noise, at a scale."""
+
+    def __init__(self, scale: int) -> None:
+        super().__init__()
+        self.scale = scale
+
+    def forward(self, mean: Tensor, hrls: Tensor, share: Tensor) -> Tensor:
+        """Draw the denoised HRLS (1, 3, s*h, s*w) towards the brightness of the denoised mean of both renders.
+
+        Args:
+            mean: (1, 3, h, w). All images are log-encoded.
+            share: of the LRHS in the mean.
+        """
+        picture = log_decode(hrls)
+        ratio = (log_decode(mean) + DARK) / (box_downsample(picture, self.scale) + DARK)
+        ratio = ratio.clamp(1 / MAX_RATIO, MAX_RATIO) ** (DRAWN + DRAWN_BY_LRHS * share)
+        return log_encode(picture * upsample(ratio, self.scale, "bilinear"))
+
+
 def _mean(lrhs: Images, hrls: Images, shares: Images) -> Images:
     return {name: hrls[name] + shares[name] * (lrhs[name] - hrls[name]) for name in hrls}
 
@@ -111,8 +144,53 @@ def same_size_model(path: Path, clean: bool) -> onnx.ModelProto:
     nodes = [n for n in model.graph.node if not n.output[0].startswith(ENTER) and n.output[0] not in made]
     tensors = [*model.graph.initializer, *graph.embedded, *graph.constants()]
     nodes, tensors = _needed([*graph.nodes, *nodes], tensors, [value.name for value in outputs])
+    return _finished(model, contract, outputs, nodes, tensors)
+
+
+def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:
+    """Return the model for pairs with little noise.
+
+    Args:
+        path: of the `joint` model at the scale of the pairs.
+        one_size: the model of the family for renders of one size with little noise.
+    """
+    model, contract = onnx.load(path, load_external_data=False), Contract.of_file(path)
+    family, _, scale = contract.name.rpartition("-x")
+    contract = replace(
+        contract, name=f"{family}{CLEAN}-x{scale}", bytes_per_pixel=BYTES_PER_PIXEL, training_spp={},
+        provenance=contract.provenance | {"made_from": contract.name},
+    )  # fmt: skip
+    graph = Nodes()
+    # One render is given as both, with shares of 0.
+    none = graph.constant("no_share", np.float32(0))
+    inputs = {value.name: value.name.replace("lrhs.", "hrls.") for value in one_size.graph.input}
+    inputs |= {name: none for name in inputs if name.startswith("share.")}
+    graph.embed(one_size, OWN, inputs | {"fused": f"{OWN}fused"})
+    images = example(contract, 4 * contract.alignment, 6 * contract.alignment)
+    images = [images[name] for name in ("lrhs.rgb", "hrls.rgb", "share.rgb")]
+    draw = traced(Draw(contract.scale), tuple(images), ["mean", "hrls", "share"], ["drawn"], contract.alignment)
+    names = {"mean": "mean.denoised", "hrls": f"{OWN}mean.denoised", "share": "share.rgb", "drawn": "encoded.fused"}
+    graph.embed(draw, "draw.", names)
+    outputs = [value for value in model.graph.output if value.name != "log_error"]
+    made = {name for node in graph.nodes for name in node.output}
+    nodes = [*graph.nodes, *(node for node in model.graph.node if made.isdisjoint(node.output))]
+    nodes, tensors = _needed(
+        nodes, [*model.graph.initializer, *graph.embedded, *graph.constants()], [value.name for value in outputs]
+    )
+    return _finished(model, contract, outputs, nodes, tensors)
+
+
+def _finished(
+    model: onnx.ModelProto, contract: Contract, outputs: list[onnx.ValueInfoProto], nodes: list[onnx.NodeProto],
+    tensors: list[onnx.TensorProto],
+) -> onnx.ModelProto:  # fmt: skip
+    """Give a model another graph and contract."""
     values = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, count, "H", "W"] if count else [])
+        helper.make_tensor_value_info(
+            name,
+            TensorProto.FLOAT,
+            [1, count, *("hw" if name[0] == "l" and contract.scale > 1 else "HW")] if count else [],
+        )
         for name, count in contract.inputs.items()
     ]
     model.graph.CopyFrom(helper.make_graph(nodes, contract.name, values, outputs, tensors))
@@ -163,8 +241,13 @@ def main() -> None:
     parser.add_argument("--clean", action="store_true", help="also write the model for renders with little noise")
     args = parser.parse_args()
     for source in filter(None, (args.model, gpu_file(args.model))):
-        for clean in (False, True)[: 1 + args.clean]:
-            model = same_size_model(source, clean)
+        models = [same_size_model(source, clean=False)]
+        if args.clean:
+            models.append(same_size_model(source, clean=True))
+            stem = source.stem.removesuffix(f"x{SCALE}")
+            pairs = [source.with_name(f"{stem}x{scale}.onnx") for scale in SCALES]
+            models += [clean_pair_model(pair, models[1]) for pair in pairs]
+        for model in models:
             file = source.with_name(f"{model.graph.name}.onnx")
             onnx.save(model, file)
             onnx.checker.check_model(file, full_check=True)

@@ -73,7 +73,9 @@ def test_recipes_make_all_models_that_ship() -> None:
                 overlaps = [int(text) for text in options[start : start + len(scales)]] if start else [24]
                 made |= dict(zip(scales, overlaps, strict=True))
             elif step.module.endswith(".same_size"):  # the LRHS of x2 has half of the size
-                made |= {path.stem: 2 * made[Path(step.arguments[0]).stem] for path in step.writes}
+                at_x2 = Path(step.arguments[0]).stem
+                for stem in dict.fromkeys(path.stem for path in step.writes):
+                    made[stem] = 2 * made[at_x2] if stem.endswith("-x1") else made[stem.replace("-clean", "")]
             elif step.module.endswith(".mean_model"):
                 made |= {path.stem: made[Path(step.arguments[0]).stem] for path in step.writes}
     assert made == {stem: Contract.of_file(WEIGHTS / f"{stem}.onnx").overlap for stem in EXPORTED}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The models of renders of one size, which are made out of those for pairs at x2."""
+"""The models for renders of one size and for little noise, which are made out of those for pairs."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,14 @@ import pytest
 pytest.importorskip("torch")
 
 import onnx
+import torch
 
 from oiio_msspl.model.catalogue import QUALITIES, WEIGHTS
-from oiio_msspl.model.contract import CLEAN, ONE_SIZE, SPREAD, Contract
+from oiio_msspl.model.contract import CLEAN, ONE_SIZE, SCALES, SPREAD, Contract
 from oiio_msspl.model.devices import gpu_file
 from oiio_msspl.model.session import Session
-from research.training.same_size import same_size_model
+from research.training.encoding import log_decode, log_encode
+from research.training.same_size import Draw, clean_pair_model, same_size_model
 
 FAMILIES = [family + noise for family in QUALITIES.values() for noise in ("", SPREAD)]
 CLEAN_FAMILIES = [QUALITIES[quality] + CLEAN for quality in ("balanced", "best")]
@@ -22,10 +24,22 @@ CLEAN_FAMILIES = [QUALITIES[quality] + CLEAN for quality in ("balanced", "best")
 def test_the_files_are_those_that_are_made_from_the_model_for_pairs(family):
     pairs = WEIGHTS / f"{family.removesuffix(CLEAN)}-x2.onnx"
     for path in (pairs, gpu_file(pairs)):
-        shipped, made = onnx.load(path.with_name(f"{family}-x1.onnx")), same_size_model(path, family.endswith(CLEAN))
-        onnx.load_external_data_for_model(made, str(path.parent))
-        assert list(shipped.graph.node) == list(made.graph.node)
-        assert _constants(shipped) == _constants(made)
+        assert _are_equal(path.with_name(f"{family}-x1.onnx"), same_size_model(path, family.endswith(CLEAN)))
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("family", CLEAN_FAMILIES)
+def test_the_files_for_pairs_with_little_noise_are_those_that_are_made(family, scale):
+    pairs = WEIGHTS / f"{family.removesuffix(CLEAN)}-x{scale}.onnx"
+    for path in (pairs, gpu_file(pairs)):
+        one_size = same_size_model(path.with_name(f"{family.removesuffix(CLEAN)}-x2.onnx"), clean=True)
+        assert _are_equal(path.with_name(f"{family}-x{scale}.onnx"), clean_pair_model(path, one_size))
+
+
+def _are_equal(file, made):
+    shipped = onnx.load(file)
+    onnx.load_external_data_for_model(made, str(file.parent))
+    return list(shipped.graph.node) == list(made.graph.node) and _constants(shipped) == _constants(made)
 
 
 def _constants(model):
@@ -50,3 +64,15 @@ def test_two_renders_are_denoised_together(family):
     one = session.run(second, second, 1.0, {})["fused"]
     noise, error, error_of_one = (np.abs(image - clean).mean() for image in (second["rgb"], both, one))
     assert error < error_of_one < 0.3 * noise
+
+
+def test_the_brightness_is_that_of_the_mean_where_all_of_its_samples_are_the_lrhs():
+    """With fewer of its samples, it is between that of the mean and that of the HRLS."""
+    scale = 2
+    mean, hrls = (torch.full((1, 3, 8 * n, 8 * n), value) for n, value in ((1, 0.2), (scale, 0.1)))
+    mean[:, :, 2:] = 0.1
+    brightness = [
+        log_decode(Draw(scale)(log_encode(mean), log_encode(hrls), torch.tensor(share)))[0, 0, 0, 0]
+        for share in (1.0, 0.5)
+    ]
+    np.testing.assert_allclose(brightness, [0.1 * 0.22 / 0.12, 0.1 * (0.22 / 0.12) ** 0.6], rtol=1e-5)

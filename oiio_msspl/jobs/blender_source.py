@@ -179,7 +179,8 @@ class RenderedShot:
         with self._keep_if_it_fails(files):
             run = self._run = self._run or self._start(files)
             if family_of(run.settings.model):  # all frames get the model that suits the first pair with noise
-                family, told = choose_model(*map_pair(*files.pair, run.settings.inputs), run.settings.model)
+                pair, error = map_pair(*files.pair, run.settings.inputs), run.settings.write.error_layer
+                family, told = choose_model(*pair, run.settings.model, error=error)
                 if told:
                     run.settings = replace(run.settings, model=family)
         if is_first:

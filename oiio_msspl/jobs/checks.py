@@ -65,10 +65,10 @@ def check_no_file(folder: Path) -> None:
             raise InputError(f"{path}: is a file, and the results of a shot need a folder; name another output")
 
 
-def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
+def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None, *, error: bool = False) -> str:
     """Return the model of all frames. A quality, ``auto`` and None are a family that suits the shot's first pair.
 
-    A warning is logged if a model that is named does not suit the noise.
+    A warning is logged if a model that is named does not suit the noise. With ``error``, it must predict its error.
 
     All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, not of
     the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its turn
@@ -85,7 +85,7 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
         try:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)
             count = len(hr.notes)
-            suitable, has_noise = choose_model(lr, hr, model)
+            suitable, has_noise = choose_model(lr, hr, model, error=error)
         except MssplError as error:
             log.debug("frame %d: %s", number, error)
             continue

@@ -99,7 +99,8 @@ def fuse_files(
     alignment = align(frame.lr, frame.hr)
     layers = bytes_held(frame.hr.file, frame.hr.beauty_channels, write)
     if memory_to_write(alignment, write, layers) <= max_memory:
-        run.settings = replace(settings, model=choose_model(frame.lr, frame.hr, model, frame.read_if_small)[0])
+        chosen, _ = choose_model(frame.lr, frame.hr, model, frame.read_if_small, error=write.error_layer)
+        run.settings = replace(settings, model=chosen)
     run.settings.session(alignment.scale)
     opened = time.perf_counter()
     for settled in run.take(views):

@@ -104,7 +104,12 @@ def bytes_of(size: int | str) -> int:
 
 
 def choose_model(
-    lr: MappedRender, hr: MappedRender, model: str | None, read: Callable[[], RenderPair] | None = None
+    lr: MappedRender,
+    hr: MappedRender,
+    model: str | None,
+    read: Callable[[], RenderPair] | None = None,
+    *,
+    error: bool = False,
 ) -> tuple[str, bool]:
     """Return the model to use, and whether the pair has noise that decides it: a black frame has none.
 
@@ -116,6 +121,7 @@ def choose_model(
         lr, hr: the pair.
         model: what the user has chosen.
         read: gives the pair in memory; None to look at small samples of the files.
+        error: the model must predict its error.
 
     Raises:
         InputError: the pair does not fit together.
@@ -138,26 +144,28 @@ def choose_model(
     if suited != family:
         family = suited
         hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
-    family, noise = family_for_noise(family, *renders(), alignment)
+    family, noise = family_for_noise(family, *renders(), alignment, error=error)
     if noise:
         hr.notes.append(f"{NOISE[noise]}, so the model is {family}")
     return family, noise is not None
 
 
 def family_for_noise(
-    family: str, lr: ReadableRender, hr: ReadableRender, alignment: Alignment
+    family: str, lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, error: bool = False
 ) -> tuple[str, str | None]:
     """Return the counterpart of a family that suits the noise of a pair, and the kind of noise.
 
     It is a key of ``NOISE``; "" for noise that needs no counterpart, and None without noise. Noise that the pixel
-    filter has spread needs weights of its own. In renders of one size with little noise, the denoiser of their mean
-    alone is more accurate. That of ``best`` denoises albedo and normal before; another one needs clean ones.
+    filter has spread needs weights of its own. Where there is little noise, a denoiser at full size that no other
+    network follows is more accurate. It needs a clean albedo and normal, except that of ``best`` for renders of one
+    size, which denoises them before. It predicts no ``error``.
     """
     spread = is_noise_spread(lr, hr, alignment)
     if spread:
         return family + SPREAD, SPREAD
-    clean = for_little_noise(family) if alignment.scale == ONE_SIZE else None
-    if clean and has_little_noise(lr, hr, alignment) and (family == QUALITIES["best"] or has_clean_aovs(hr, alignment)):
+    clean = None if error else for_little_noise(family)
+    denoises_aovs = family == QUALITIES["best"] and alignment.scale == ONE_SIZE
+    if clean and has_little_noise(lr, hr, alignment) and (denoises_aovs or has_clean_aovs(hr, alignment)):
         return clean, CLEAN
     return family, None if spread is None else ""
 

@@ -132,7 +132,7 @@ def fuse_shot(
     to_fuse, skipped = running.add_known(existing, earlier)
     if to_fuse:
         with limit_threads(threads):
-            settings = replace(settings, model=model_of_shot(shot, inputs, model))
+            settings = replace(settings, model=model_of_shot(shot, inputs, model, error=write.error_layer))
         ExistingResults(settings, plan).check_weights(skipped)
         report.found = look_ahead(to_fuse, settings)
         if client is None and report.found is not None:

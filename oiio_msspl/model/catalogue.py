@@ -56,7 +56,7 @@ def for_spread_noise(name: str) -> str | None:
 
 
 def for_little_noise(family: str) -> str | None:
-    """Return the counterpart of a family for renders of one size with little noise; None if there is none."""
+    """Return the counterpart of a family for renders with little noise; None if there is none."""
     return family + CLEAN if f"{family}{CLEAN}-x{ONE_SIZE}" in shipped_models() else None
 
 

@@ -23,7 +23,7 @@ ONE_SIZE = 1
 
 #: Ending of the names of models for renders whose pixel filter has spread the noise.
 SPREAD = "-spread"
-#: Ending of the names of models for renders of one size with little noise.
+#: Ending of the names of models for renders with little noise.
 CLEAN = "-clean"
 #: Values of ``Contract.denoiser``: none; a denoiser of both renders' mean; a small one. ``SPREAD`` may follow.
 NO_DENOISER, MEAN_DENOISER, SMALL_MEAN_DENOISER = "", "mean", "mean-small"

@@ -4,9 +4,9 @@
     python -m research.benchmarks.one_size RENDERS --one 32 --two 16:32 --table research/benchmarks/results/one_size.csv
 
 RENDERS are those of :mod:`research.benchmarks.scenes`. "best-x1" is the model that `--quality best` takes for the noise
-of one render, "best-x1, two seeds" that for two of the same size, "joint-large-x2" that for an LRHS of half the size
-and an HRLS with half of the samples each. "OIDN" and "OIDN prefiltered" get the one render, and "OIDN, two seeds" the
-mean of both, weighted by their spp.
+of one render, "best-x1, two seeds" that for two of the same size, "best-x2" that for an LRHS of half the size and an
+HRLS with half of the samples each. "OIDN" and "OIDN prefiltered" get the one render, and "OIDN, two seeds" the mean of
+both, weighted by their spp.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.jobs.settings import family_for_noise
 from oiio_msspl.model.catalogue import QUALITIES, load_model
-from oiio_msspl.model.contract import ONE_SIZE
 from oiio_msspl.model.session import Session
 from research.benchmarks import results, scenes
 from research.benchmarks.accuracy import KEYS, with_means
@@ -32,8 +31,8 @@ from research.benchmarks.results import Row
 
 #: Ending of a method that gets two renders of one size.
 SEEDS = ", two seeds"
-#: Scale of the pair of two sizes.
-PAIR = 2
+#: Scales of pairs of two sizes.
+PAIRS = (2, 4)
 
 #: A method, its model if it is one of ours, and a function that computes its picture.
 Method = tuple[str, str | None, Callable[[], Array]]
@@ -45,11 +44,9 @@ def of_one(scene: scenes.Scene, spp: int) -> Iterator[Method]:
     yield "render", None, partial(scenes.beauty, render)
     yield "OIDN", None, partial(oidn, render)
     yield "OIDN prefiltered", None, partial(oidn_prefiltered, render)
-    yield from _of_one_size(render, render)
-    for quality in QUALITIES:
-        session = _loaded(PAIR, quality)
-        pair = scene.lrhs(PAIR, spp // 2), scene.hrls(spp // 2)
-        yield session.name, session.name, partial(_fused, *pair, session)
+    yield from _chosen(render, render)
+    for scale in PAIRS:
+        yield from _chosen(scene.lrhs(scale, spp // 2), scene.hrls(spp // 2))
 
 
 def of_two(scene: scenes.Scene, spp: tuple[int, int]) -> Iterator[Method]:
@@ -61,14 +58,16 @@ def of_two(scene: scenes.Scene, spp: tuple[int, int]) -> Iterator[Method]:
     yield f"render{SEEDS}", None, partial(scenes.beauty, mean)
     yield f"OIDN{SEEDS}", None, partial(oidn, mean)
     yield f"OIDN prefiltered{SEEDS}", None, partial(oidn_prefiltered, mean)
-    for method, model, picture in _of_one_size(first, second, share):
+    for method, model, picture in _chosen(first, second, share):
         yield f"{method}{SEEDS}", model, picture
 
 
-def _of_one_size(lr: ReadableRender, hr: ReadableRender, share: float | None = None) -> Iterator[Method]:
+def _chosen(lr: ReadableRender, hr: ReadableRender, share: float | None = None) -> Iterator[Method]:
+    """Yield each quality, with the model that it takes for the noise of the renders."""
+    alignment = align(lr, hr)
     for quality, family in QUALITIES.items():
-        session = _loaded(ONE_SIZE, family_for_noise(family, lr, hr, align(lr, hr))[0])
-        yield f"{quality}-x1", session.name, partial(_fused, lr, hr, session, share)
+        session = _loaded(alignment.scale, family_for_noise(family, lr, hr, alignment)[0])
+        yield f"{quality}-x{alignment.scale}", session.name, partial(_fused, lr, hr, session, share)
 
 
 _loaded = functools.cache(load_model)

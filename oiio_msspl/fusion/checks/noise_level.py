@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks whether renders of one size have little noise, for which there are other models, and how clean AOVs are."""
+"""Checks whether renders have little noise, for which there are other models, and how clean AOVs are."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from oiio_msspl.fusion.checks.spread_noise import CACHE_BYTES, blocks_of, correl
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.model.contract import ONE_SIZE
 from oiio_msspl.model.encoding import encode_radiance, find_exposure
 
 #: Standard deviation of the noise in blocks, log-encoded, and the share of the blocks with less: the others may have
@@ -18,19 +19,20 @@ from oiio_msspl.model.encoding import encode_radiance, find_exposure
 LITTLE, SMOOTH = 0.07, 0.25
 #: Blocks of an AOV show edges or texture from this variance on. There, neighbouring pixels of clean AOVs correlate by
 #: more than the second number, in the mean: at 1, 2, 4, 8 and 16 spp by some 0.27, 0.37, 0.44, 0.47 and 0.50.
-EDGES, CLEAN = 1e-4, 0.45
+EDGES, CLEAN = 1e-4, 0.46
 
 
 def has_little_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool:
-    """Return whether the mean of two renders of one size has little noise; one render is given as both.
+    """Return whether an HRLS has little noise, or the mean of two renders of one size; one render is given as both.
 
     Small samples all over the frame are read.
     """
-    deviations, window = [], alignment.hr_data_window
+    deviations, window, scale = [], alignment.hr_data_window, alignment.scale
     with hr.cache_strips(CACHE_BYTES), lr.cache_strips(CACHE_BYTES):
-        for area in sample_windows(alignment.grid):
+        for grid in sample_windows(alignment.grid):
+            area = in_hrls_pixels(grid, scale)
             mean = read_features(hr, area, window, [RGB])[RGB]
-            if lr is not hr:
+            if scale == ONE_SIZE and lr is not hr:
                 mean = (mean + read_features(lr, area, window, [RGB])[RGB]) / np.float32(2)
             image = encode_radiance(luminance(mean)[..., None], find_exposure(mean))[..., 0]
             deviations.append(noise_in(blocks_of(image)).std(axis=(1, 2)))

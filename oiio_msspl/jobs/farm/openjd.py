@@ -133,7 +133,7 @@ def make_job(
     files = {"--map-file": map_file} if map_file else {}
     shot = find_shot(lr, hr, output, frames)
     # The job names its model: a worker with another version, which would choose another family, then refuses the frame.
-    family = model_of_shot(shot, inputs, model)
+    family = model_of_shot(shot, inputs, model, error="--error-layer" in options)
     if shipped_models().keys() & {family, *(f"{family}-x{scale}" for scale in (ONE_SIZE, *SCALES))}:
         options += ["--model", family]
     else:

@@ -86,8 +86,8 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None, *, error:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)
             count = len(hr.notes)
             suitable, has_noise = choose_model(lr, hr, model, error=error)
-        except MssplError as error:
-            log.debug("frame %d: %s", number, error)
+        except MssplError as failure:
+            log.debug("frame %d: %s", number, failure)
             continue
         if has_noise:
             for note in hr.notes[count:]:

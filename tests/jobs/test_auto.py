@@ -144,7 +144,7 @@ def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_pa
     assert "so the model is joint-spread" in caplog.text
     assert fuse_shot(*pair[:2], tmp_path / "chunk", frames=[3]).exit_code == 0
     assert open_exr(tmp_path / "chunk/a.0003.exr").metadata["msspl/model"] == "joint-spread-x4"
-    monkeypatch.setattr("oiio_msspl.jobs.shot.model_of_shot", lambda *arguments: pytest.fail("reads a pair"))
+    monkeypatch.setattr("oiio_msspl.jobs.shot.model_of_shot", lambda *arguments, **options: pytest.fail("reads a pair"))
     assert fuse_shot(*pair, frames=[2, 3], skip_existing=True).results[2].status == "skipped"
     monkeypatch.undo()
     action = make_job(*pair).template["steps"][0]["script"]["actions"]["onRun"]

@@ -5,8 +5,10 @@ Where the renders have many samples, a network erases detail that no AOV shows. 
 fused picture is noise and lost detail. The pair tells them apart: both renders are independent, so the difference of
 the LRHS to the means of the HRLS is the noise of the two. Where the fused picture differs by more than that noise
 explains, a part of the difference is put back, as much as James and Stein's estimator keeps (Gu et al. 2022,
-*Neural James-Stein Combiner*, without a network). A test of significance decides first, so that chance and fireflies
-are not taken for detail (Firmino et al. 2022, *Progressive Denoising of Monte Carlo Rendered Images*).
+*Neural James-Stein Combiner*, without a network). The picture may have kept a part of the HRLS's noise. So the LRHS is
+asked as well: what both renders show at an LRHS pixel and the picture lacks is detail. A test of significance decides
+first, so that chance and fireflies are not taken for detail (Firmino et al. 2022, *Progressive Denoising of Monte Carlo
+Rendered Images*).
 """
 
 from __future__ import annotations
@@ -94,6 +96,7 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
         render = render + np.float32(renders.share) * (low - render)
     factors = [_light_factor(*planes, renders.share, reach) for planes in zip(own, lrhs, means, strict=True)]
     picture = np.stack([_multiplied(*planes) for planes in zip(picture, factors, strict=True)])
+    own = [plane * factor for plane, factor in zip(own, factors, strict=True)]
     energy, darker, brightness = _difference(picture, render, scale, exposure)
     # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of
     # the mean of both renders is E d^2 share (1 - share).
@@ -101,6 +104,10 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     noise = variance * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
     relative = len(picture) * np.square(brightness)
     trust, points = _trust_in_detail(energy / relative, noise / relative, darker, scale, reach)
+    target = means if scale > 1 else [_exposed(plane, exposure) for plane in render]
+    common = reduce(np.add, ((low - mine) * (high - mine) for low, high, mine in zip(lrhs, means, own, strict=True)))
+    change = reduce(np.add, (np.square(best - mine) for best, mine in zip(target, own, strict=True)))
+    np.maximum(trust, _trust_of_both(common / relative, change / relative, darker, _sizes(reach)), out=trust)
     for plane, pixels in zip(picture, render, strict=True):
         _blend(plane, pixels, trust, points)
     return np.moveaxis(picture, 0, -1), trust
@@ -136,8 +143,7 @@ def _trust_in_detail(energy: Array, noise: Array, darker: Mask, scale: int, reac
         darker: the renders are darker than the picture.
         scale, reach: as in :func:`trust_renders`.
     """
-    sizes = [size for size in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
-    most = np.float32(LARGEST * scale**2)
+    sizes, most = _sizes(reach), np.float32(LARGEST * scale**2)
     areas = _trust_in_areas(energy, noise, darker, most, sizes)
     points = _trust_in_points(energy, noise, darker, most, sizes[-1])
     return np.maximum(areas, points), points
@@ -164,6 +170,32 @@ def _trust_in_areas(energy: Array, noise: Array, darker: Mask, most: np.float32,
     return trust
 
 
+def _trust_of_both(common: Array, change: Array, darker: Mask, sizes: Sequence[int]) -> Array:
+    """Return how much of a difference at the LRHS's resolution both renders agree on, (h, w) in [0, 1].
+
+    Their noise is independent, so the mean of the product of their differences to the picture is the square of its
+    error. Where light is rare, most windows lack it, and both renders agree that they are dark. So a window that is
+    darker also needs brighter pixels on which they agree.
+
+    Args:
+        common: product of both renders' differences to the picture, relative to the brightness.
+        change: squared difference of the picture to the render that is put back.
+        darker: the renders are darker than the picture.
+        sizes: reaches of the windows.
+    """
+    common, change = np.clip(common, -LARGEST, LARGEST), np.minimum(change, np.float32(LARGEST))
+    lit = np.where(darker, np.minimum(common, 0), common)
+    means, changes, lights = (means_around(plane, sizes) for plane in (common, change, lit))
+    squares, light_squares = (means_around(np.square(plane), sizes) for plane in (common, lit))
+    trust = np.zeros_like(common)
+    for i, (share, size) in enumerate(zip(means_around(darker.astype(np.float32), sizes), sizes, strict=True)):
+        certain = _certainty(means[i], squares[i], size)
+        certain *= np.where(share > MOSTLY, _certainty(lights[i], light_squares[i], size), np.float32(1))
+        part = certain * np.clip(means[i] / np.maximum(changes[i], np.float32(1e-12)), 0, 1)
+        np.maximum(trust, means_around(part, [size])[0], out=trust)
+    return trust
+
+
 def _trust_in_points(energy: Array, noise: Array, darker: Mask, most: np.float32, size: int) -> Array:
     """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1].
 
@@ -180,6 +212,11 @@ def _trust_in_points(energy: Array, noise: Array, darker: Mask, most: np.float32
     alone = _kept(light, np.float32(ALONE) * max_around(noise, size))
     is_point = energy > np.float32(POINT)
     return is_point * np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
+
+
+def _sizes(reach: int) -> list[int]:
+    """Return the reaches of the windows, given the largest distance over which a pixel may depend on others."""
+    return [size for size in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
 
 
 def _certainty(excess: Array, squares: Array, size: int) -> Array:

@@ -61,6 +61,16 @@ def test_detail_that_both_renders_show_comes_back(scale: int) -> None:
     assert trust.mean() > 0.7
 
 
+def test_a_picture_that_keeps_the_noise_of_the_hrls_does_not_hide_its_own_error() -> None:
+    """It differs from the HRLS by no more than noise, so only the LRHS tells that it is worse."""
+    truth = wall()
+    renders = pair(truth, (256, 64))
+    fused = rendered(renders.hrls, 40, 5)
+    result, _ = trust_renders(fused, renders, REACH)
+    assert rms(fused, truth) > 1.5 * rms(renders.hrls, truth)
+    assert rms(result, truth) < 1.15 * rms(renders.hrls, truth)
+
+
 def test_two_renders_of_one_size_tell_their_noise() -> None:
     y, x = np.mgrid[:SIZE, :SIZE]
     truth = wall() * (1 + 0.3 * np.where((x // 2 + y // 3) % 2, 1, -1))[..., None].astype(np.float32)

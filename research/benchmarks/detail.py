@@ -4,8 +4,8 @@
     python -m research.benchmarks.detail --table research/benchmarks/results/detail.csv
 
 Scenes have an exact reference (:mod:`research.benchmarks.stability.analytic`). Their light has structure, and albedo
-and normal do not. PSNR is that of the pictures in sRGB, which clips at 1. ``light`` is the mean of the picture as a
-share of the reference's, which does not.
+and normal do not. Each quality takes the model for the noise of the pair. PSNR is that of the pictures in sRGB, which
+clips at 1. ``light`` is the mean of the picture as a share of the reference's, which does not.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ import numpy as np
 
 from oiio_msspl import fuse
 from oiio_msspl.compare import scores
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array
+from oiio_msspl.jobs.settings import family_for_noise
 from oiio_msspl.model.catalogue import QUALITIES, load_model
 from research.benchmarks import results
 from research.benchmarks.peers import oidn_prefiltered
@@ -128,14 +130,16 @@ def measure(case: str, samples: tuple[int, int]) -> Iterator[Row]:
         "HRLS": lambda: high.layers["rgb"],
         "OIDN prefiltered on the HRLS": partial(oidn_prefiltered, high),
     }
-    for family in QUALITIES.values():
-        session = load_model(SCALE, family)
-        pictures[session.name] = partial(lambda session: fuse(low, high, session).rgb, session)
-        pictures[session.name + NETWORK_ALONE] = partial(lambda s: fuse(low, high, s, trust=False).rgb, session)
+    models = {}
+    for quality, family in QUALITIES.items():
+        session = load_model(SCALE, family_for_noise(family, low, high, align(low, high))[0])
+        for method, trust in ((quality, True), (quality + NETWORK_ALONE, False)):
+            models[method] = {"model": session.name}
+            pictures[method] = partial(lambda session, trust: fuse(low, high, session, trust=trust).rgb, session, trust)
     for method, picture in pictures.items():
         image = picture()
         score = scores(image, truth)
-        row: Row = {"case": case, "spp": f"{low_spp}-{high_spp}", "method": method, **results.model_of(method)}
+        row: Row = {"case": case, "spp": f"{low_spp}-{high_spp}", "method": method} | models.get(method, {})
         row |= {"psnr": score["psnr"], "relmse": score["relmse"]}
         yield row | {"light": float(image.mean(dtype=np.float64) / truth.mean(dtype=np.float64))}
 

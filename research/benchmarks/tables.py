@@ -155,8 +155,8 @@ DETAIL = Table(
         for method, title in {
             "HRLS": "HRLS",
             "OIDN prefiltered on the HRLS": "OIDN",
-            BEST + detail.NETWORK_ALONE: "`best`, network alone",
-            BEST: "`best`",
+            f"best{detail.NETWORK_ALONE}": "`best`, network alone",
+            "best": "`best`",
         }.items()
     ],
 )

@@ -166,9 +166,9 @@ def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:
     inputs = {value.name: value.name.replace("lrhs.", "hrls.") for value in one_size.graph.input}
     inputs |= {name: none for name in inputs if name.startswith("share.")}
     graph.embed(one_size, OWN, inputs | {"fused": f"{OWN}fused"})
-    images = example(contract, 4 * contract.alignment, 6 * contract.alignment)
-    images = [images[name] for name in ("lrhs.rgb", "hrls.rgb", "share.rgb")]
-    draw = traced(Draw(contract.scale), tuple(images), ["mean", "hrls", "share"], ["drawn"], contract.alignment)
+    inputs_of_draw = example(contract, 4 * contract.alignment, 6 * contract.alignment)
+    images = tuple(inputs_of_draw[name] for name in ("lrhs.rgb", "hrls.rgb", "share.rgb"))
+    draw = traced(Draw(contract.scale), images, ["mean", "hrls", "share"], ["drawn"], contract.alignment)
     names = {"mean": "mean.denoised", "hrls": f"{OWN}mean.denoised", "share": "share.rgb", "drawn": "encoded.fused"}
     graph.embed(draw, "draw.", names)
     outputs = [value for value in model.graph.output if value.name != "log_error"]

@@ -103,11 +103,11 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     variance = np.float32(renders.share * (scale**2 if scale > 1 else 1 - renders.share))
     noise = variance * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
     relative = len(picture) * np.square(brightness)
-    trust, points = _trust_in_detail(energy / relative, noise / relative, darker, scale, reach)
     target = means if scale > 1 else [_exposed(plane, exposure) for plane in render]
     common = reduce(np.add, ((low - mine) * (high - mine) for low, high, mine in zip(lrhs, means, own, strict=True)))
     change = reduce(np.add, (np.square(best - mine) for best, mine in zip(target, own, strict=True)))
-    np.maximum(trust, _trust_of_both(common / relative, change / relative, darker, _sizes(reach)), out=trust)
+    energy, noise, common, change = (values / relative for values in (energy, noise, common, change))
+    trust, points = _trust_in_detail(energy, noise, common, change, darker, scale, reach)
     for plane, pixels in zip(picture, render, strict=True):
         _blend(plane, pixels, trust, points)
     return np.moveaxis(picture, 0, -1), trust
@@ -135,63 +135,70 @@ def _difference(picture: Array, render: Array, scale: int, exposure: np.float32)
     return energy, excess < 0, _brightness(mean)
 
 
-def _trust_in_detail(energy: Array, noise: Array, darker: Mask, scale: int, reach: int) -> tuple[Array, Array]:
+def _trust_in_detail(
+    energy: Array, noise: Array, common: Array, change: Array, darker: Mask, scale: int, reach: int
+) -> tuple[Array, Array]:
     """Return how much of a difference is detail, (h, w) in [0, 1], and the part that is judged pixel by pixel.
 
     Args:
-        energy, noise: squared difference relative to the brightness, and the part of it that noise explains.
+        energy, noise: squared difference to the render that is put back, and the part of it that noise explains; these
+            and the next two are relative to the brightness.
+        common: product of both renders' differences to the picture, at the LRHS's resolution.
+        change: squared difference to the render that is put back, at this resolution.
         darker: the renders are darker than the picture.
         scale, reach: as in :func:`trust_renders`.
     """
-    sizes, most = _sizes(reach), np.float32(LARGEST * scale**2)
-    areas = _trust_in_areas(energy, noise, darker, most, sizes)
+    sizes = [size for size in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
+    most = np.float32(LARGEST * scale**2)
+    # Most windows lack rare light.
+    dark = [share > MOSTLY for share in means_around(darker.astype(np.float32), sizes)]
+    areas = _trust_in_areas(energy, noise, dark, most, sizes)
+    both = _trust_of_both(common, change, darker, dark, sizes)
     points = _trust_in_points(energy, noise, darker, most, sizes[-1])
-    return np.maximum(areas, points), points
+    return np.maximum(np.maximum(areas, both), points), points
 
 
-def _trust_in_areas(energy: Array, noise: Array, darker: Mask, most: np.float32, sizes: Sequence[int]) -> Array:
+def _trust_in_areas(energy: Array, noise: Array, dark: Sequence[Mask], most: np.float32, sizes: Sequence[int]) -> Array:
     """Return how much of a difference is detail by the means of windows, (h, w) in [0, 1].
 
     Args:
         energy, noise: squared difference, and the part of it that noise explains.
-        darker: the renders are darker than the picture.
+        dark: most of a window is darker than the picture, for each size.
         most: values are limited to this.
         sizes: reaches of the windows.
     """
-    # Most windows lack rare light, and the noise that it makes. So a window that is darker has the noise of all around.
+    # Windows that lack rare light lack the noise that it makes, too. So one that is darker has the noise of all around.
     noise_around = means_around(noise, sizes[-1:])[0]
     energy, noise = np.minimum(energy, most), np.minimum(noise, most)
     energies, noises, squares = (means_around(x, sizes) for x in (energy, noise, np.square(energy) + np.square(noise)))
     trust = np.zeros_like(energy)
-    for i, (share, size) in enumerate(zip(means_around(darker.astype(np.float32), sizes), sizes, strict=True)):
-        explained = np.where(share > MOSTLY, np.maximum(noises[i], noise_around), noises[i])
+    for i, size in enumerate(sizes):
+        explained = np.where(dark[i], np.maximum(noises[i], noise_around), noises[i])
         part = _certainty(energies[i] - explained, squares[i], size) * _kept(energies[i], explained)
         np.maximum(trust, means_around(part, [size])[0], out=trust)
     return trust
 
 
-def _trust_of_both(common: Array, change: Array, darker: Mask, sizes: Sequence[int]) -> Array:
-    """Return how much of a difference at the LRHS's resolution both renders agree on, (h, w) in [0, 1].
+def _trust_of_both(common: Array, change: Array, darker: Mask, dark: Sequence[Mask], sizes: Sequence[int]) -> Array:
+    """Return how much of a difference both renders agree on, (h, w) in [0, 1].
 
     Their noise is independent, so the mean of the product of their differences to the picture is the square of its
-    error. Where light is rare, most windows lack it, and both renders agree that they are dark. So a window that is
-    darker also needs brighter pixels on which they agree.
+    error. Both agree that windows without rare light are dark. So a window that is darker also needs brighter pixels on
+    which they agree.
 
     Args:
-        common: product of both renders' differences to the picture, relative to the brightness.
-        change: squared difference of the picture to the render that is put back.
-        darker: the renders are darker than the picture.
-        sizes: reaches of the windows.
+        common, change, darker: as for :func:`_trust_in_detail`.
+        dark, sizes: as for :func:`_trust_in_areas`.
     """
-    common, change = np.clip(common, -LARGEST, LARGEST), np.minimum(change, np.float32(LARGEST))
-    lit = np.where(darker, np.minimum(common, 0), common)
+    largest = np.float32(LARGEST)
+    common, change = np.clip(common, -largest, largest), np.minimum(change, largest)
+    lit: Array = np.where(darker, np.minimum(common, np.float32(0)), common)
     means, changes, lights = (means_around(plane, sizes) for plane in (common, change, lit))
-    squares, light_squares = (means_around(np.square(plane), sizes) for plane in (common, lit))
+    squares = means_around(common * common, sizes)
     trust = np.zeros_like(common)
-    for i, (share, size) in enumerate(zip(means_around(darker.astype(np.float32), sizes), sizes, strict=True)):
-        certain = _certainty(means[i], squares[i], size)
-        certain *= np.where(share > MOSTLY, _certainty(lights[i], light_squares[i], size), np.float32(1))
-        part = certain * np.clip(means[i] / np.maximum(changes[i], np.float32(1e-12)), 0, 1)
+    for i, size in enumerate(sizes):
+        least = np.where(dark[i], np.minimum(means[i], lights[i]), means[i])
+        part = _certainty(least, squares[i], size) * _kept(changes[i], changes[i] - means[i])
         np.maximum(trust, means_around(part, [size])[0], out=trust)
     return trust
 
@@ -212,11 +219,6 @@ def _trust_in_points(energy: Array, noise: Array, darker: Mask, most: np.float32
     alone = _kept(light, np.float32(ALONE) * max_around(noise, size))
     is_point = energy > np.float32(POINT)
     return is_point * np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
-
-
-def _sizes(reach: int) -> list[int]:
-    """Return the reaches of the windows, given the largest distance over which a pixel may depend on others."""
-    return [size for size in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
 
 
 def _certainty(excess: Array, squares: Array, size: int) -> Array:

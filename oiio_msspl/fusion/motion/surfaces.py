@@ -106,8 +106,14 @@ def _means_at(image: Array, x: Array, y: Array) -> Array:
     total = np.zeros((len(x), image.shape[-1]), np.float32)
     for row, column in itertools.product((-1, 0, 1), repeat=2):
         nearest = nearest_indices(np.clip(x + column, 0, width - 1), np.clip(y + row, 0, height - 1), (height, width))
-        total += np.nan_to_num(image.reshape(-1, image.shape[-1]).take(nearest, axis=0), posinf=0, neginf=0)
+        # An image may be stored in planes, and reshaping it would copy all of it.
+        total += _finite(image[np.unravel_index(nearest, (height, width))])
     return total / np.float32(9)
+
+
+def _finite(values: Array) -> Array:
+    """Return values with 0 in place of NaN and infinities."""
+    return np.where(np.isfinite(values), values, np.float32(0))
 
 
 def _at_places(
@@ -122,8 +128,11 @@ def _at_places(
     first, last = (min(max(int(end), window.y0), window.y1 - 1) for end in ends)
     place = Window(window.x0, first, window.x1, last + 1)
     nearest = nearest_indices(x - place.x0, y - place.y0, (place.height, place.width))
-    layers = render.read(place, names)
-    return {name: image.reshape(-1, image.shape[-1]).take(nearest, axis=0) for name, image in layers.items()}, inside
+    layers = {}
+    for name, image in render.read(place, names).items():
+        planes = np.stack([plane.ravel().take(nearest) for plane in planes_of(image)])
+        layers[name] = np.moveaxis(planes, 0, -1)
+    return layers, inside
 
 
 def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mask) -> Mask:
@@ -136,7 +145,7 @@ def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mas
         around = slice(max(first - REACH, 0), min(last + REACH, height))
         other = np.zeros((around.stop - around.start, width), np.bool_)
         for name, image in here.items():
-            one, two = (np.nan_to_num(planes_of(x[around]), posinf=0, neginf=0) for x in (image, there[name]))
+            one, two = (_finite(planes_of(x[around])) for x in (image, there[name]))
             least = np.float32(TURN if name == NORMAL else DIFFERENCE)
             limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + least
             differs = _show_another(one, two, limit, (_distance(one, two) > limit) & compared[around])

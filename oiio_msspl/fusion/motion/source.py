@@ -135,7 +135,9 @@ class MotionSource:
 
         Return (h, w) over the data window of ``frame``; None if all motion is estimated from the pixels themselves.
         """
-        return None if self.kind == FLOW else other_surfaces(*self._compared(frame, neighbour), vectors, known)
+        if self.kind == FLOW:
+            return None
+        return other_surfaces(*self._compared(frame, neighbour), vectors, known, turns=self.kind == VECTORS)
 
     def _compared(self, frame: MotionFrame, neighbour: MotionFrame) -> tuple[ReadableRender, ReadableRender, list[str]]:
         """Return the features of two frames, and the names of those that a surface keeps."""

@@ -22,7 +22,7 @@ from oiio_msspl.image.sampling import nearest_indices
 #: A pixel differs between two frames if a layer has changed by more than a constant and a multiple of the difference of
 #: two pixels of one surface, which is its texture and noise.
 DIFFERENCE, MULTIPLE = 0.03, 3.0
-#: The constant for normals: those of a thing that turns change by up to 6 degrees.
+#: The constant for normals, if vectors follow things that turn: these change by up to 6 degrees.
 TURN = 0.1
 #: The surface is another one if this many of 3 x 3 pixels differ. Single ones are noise.
 PIXELS = 4
@@ -42,7 +42,13 @@ PIXELS_AT_ONCE = 1 << 22
 
 
 def other_surfaces(
-    here: ReadableRender, there: ReadableRender, names: Sequence[str], vectors: Array, known: Mask
+    here: ReadableRender,
+    there: ReadableRender,
+    names: Sequence[str],
+    vectors: Array,
+    known: Mask,
+    *,
+    turns: bool = True,
 ) -> Mask:
     """Find the pixels (h, w) of a frame where its neighbour shows another surface, and those beside them.
 
@@ -51,6 +57,7 @@ def other_surfaces(
         names: layers of both frames that have no light, such as the albedo. Without any, no surface is another one.
         vectors: to the places of the surfaces in the neighbour, (h, w, 2) in HRLS pixels.
         known: which vectors can be believed, (h, w). Other pixels are not compared.
+        turns: vectors follow things that turn, so their normals may change.
     """
     window, height = here.data_window, here.data_window.height
     result = np.zeros(known.shape, np.bool_)
@@ -60,7 +67,7 @@ def other_surfaces(
         around = slice(max(top - REACH, 0), min(last + REACH, height))
         area = Window(window.x0, window.y0 + around.start, window.x1, window.y0 + around.stop)
         layers, compared = _at_places(there, names, area, vectors[around], known[around])
-        differs = _differ(here.read(area, names), layers, compared)
+        differs = _differ(here.read(area, names), layers, compared, TURN if turns else DIFFERENCE)
         result[top:last] = differs[top - around.start :][: last - top]
         for render in (here, there):
             render.unload()
@@ -135,8 +142,11 @@ def _at_places(
     return layers, inside
 
 
-def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mask) -> Mask:
-    """Find the pixels (h, w) where layers (h, w, c) show another surface, and those beside them."""
+def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mask, turn: float) -> Mask:
+    """Find the pixels (h, w) where layers (h, w, c) show another surface, and those beside them.
+
+    Normals may change by ``turn``.
+    """
     height, width = compared.shape
     result = np.empty((height, width), np.bool_)
 
@@ -146,7 +156,7 @@ def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mas
         other = np.zeros((around.stop - around.start, width), np.bool_)
         for name, image in here.items():
             one, two = (_finite(planes_of(x[around])) for x in (image, there[name]))
-            least = np.float32(TURN if name == NORMAL else DIFFERENCE)
+            least = np.float32(turn if name == NORMAL else DIFFERENCE)
             limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + least
             differs = _show_another(one, two, limit, (_distance(one, two) > limit) & compared[around])
             other |= sum_3x3(differs.astype(np.float32)) >= PIXELS

@@ -43,11 +43,13 @@ def test_a_blurred_edge_with_few_samples_is_no_other_surface():
     assert other_surfaces(*renders, ["albedo"], vectors, np.ones((SIZE, SIZE), bool)).mean() < 0.002
 
 
-def test_a_thing_that_turns_is_the_same_surface():
+def test_a_thing_that_turns_is_the_same_surface_if_vectors_follow_it():
     renders = []
     for degrees in (30, 34):
         normal = np.zeros((SIZE, SIZE, 3), np.float32)
         normal[..., 0], normal[..., 2] = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
         renders.append(Render.from_arrays("frame", rgb=normal, normal=normal))
     vectors = np.zeros((SIZE, SIZE, 2), np.float32)
-    assert not other_surfaces(*renders, ["normal"], vectors, np.ones((SIZE, SIZE), bool)).any()
+    pair = *renders, ["normal"], vectors, np.ones((SIZE, SIZE), bool)
+    assert not other_surfaces(*pair).any()
+    assert other_surfaces(*pair, turns=False).all()

@@ -26,8 +26,7 @@ from tests.conftest import SHARED, needs_shared
 CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 #: Files for GPUs, relative to the folder of the weights.
 FAMILIES = tuple(family + noise for family in ("joint-small", "joint", "joint-large") for noise in ("", "-spread"))
-GPU_FILES = [f"gpu/{family}-x{scale}.onnx" for family in FAMILIES for scale in (ONE_SIZE, *SCALES)]
-GPU_FILES += ["gpu/mean-x1.onnx", "gpu/mean-spread-x1.onnx"]
+GPU_FILES = [f"gpu/{path.name}" for path in sorted(WEIGHTS.glob("gpu/*.onnx"))]
 
 
 def test_a_gpu_gets_the_file_that_was_made_for_it(tmp_path):

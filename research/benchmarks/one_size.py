@@ -4,9 +4,9 @@
     python -m research.benchmarks.one_size RENDERS --one 32 --two 16:32 --table research/benchmarks/results/one_size.csv
 
 RENDERS are those of :mod:`research.benchmarks.scenes`. "best-x1" is the model that `--quality best` takes for the noise
-of one render, "best-x1, two seeds" that for two of the same size, "best-x2" that for an LRHS of half the size and an
-HRLS with half of the samples each. "OIDN" and "OIDN prefiltered" get the one render, and "OIDN, two seeds" the mean of
-both, weighted by their spp.
+of one render, "best-x1, two seeds" that for two of the same size, "best-x2" and "best-x4" that for an LRHS of half
+or a quarter of the size and an HRLS with half of the samples each. "OIDN" and "OIDN prefiltered" get the one render,
+and "OIDN, two seeds" the mean of both, weighted by their spp.
 """
 
 from __future__ import annotations

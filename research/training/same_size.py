@@ -96,7 +96,11 @@ class EnterMean(Enter):
 
 
 class Draw(nn.Module):
-    """What comes after the denoisers of a pair with little noise, at a scale."""
+    """What comes after the denoisers of a pair with little noise.
+
+    Args:
+        scale: of the pair.
+    """
 
     def __init__(self, scale: int) -> None:
         super().__init__()
@@ -185,12 +189,10 @@ def _finished(
     tensors: list[onnx.TensorProto],
 ) -> onnx.ModelProto:  # fmt: skip
     """Give a model another graph and contract."""
+    low = "HW" if contract.scale == ONE_SIZE else "hw"
+    shapes = {name: [1, count, *(low if name.startswith("lrhs") else "HW")] for name, count in contract.inputs.items()}
     values = [
-        helper.make_tensor_value_info(
-            name,
-            TensorProto.FLOAT,
-            [1, count, *("hw" if name[0] == "l" and contract.scale > 1 else "HW")] if count else [],
-        )
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, shapes[name] if count else [])
         for name, count in contract.inputs.items()
     ]
     model.graph.CopyFrom(helper.make_graph(nodes, contract.name, values, outputs, tensors))

@@ -13,7 +13,7 @@ from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.contract import ONE_SIZE
 
-#: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``, which has the noise of 1 spp.
+#: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``, whose HRLS has 2 spp.
 SCORES = {
     "joint-clean-x1": (22.73, 0.0296),
     "joint-clean-x2": (23.21, 0.0281),

@@ -104,7 +104,7 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     noise = variance * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
     relative = len(picture) * np.square(brightness)
     target = means if scale > 1 else [_exposed(plane, exposure) for plane in render]
-    common = reduce(np.add, ((low - mine) * (high - mine) for low, high, mine in zip(lrhs, means, own, strict=True)))
+    common = reduce(np.add, ((a - mine) * (b - mine) for a, b, mine in zip(lrhs, means, own, strict=True)))
     change = reduce(np.add, (np.square(best - mine) for best, mine in zip(target, own, strict=True)))
     energy, noise, common, change = (values / relative for values in (energy, noise, common, change))
     trust, points = _trust_in_detail(energy, noise, common, change, darker, scale, reach)

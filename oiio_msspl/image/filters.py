@@ -190,7 +190,7 @@ def blurred(plane: Array, times: int = 1) -> Array:
     """Blur a plane (h, w) with the weights 1, 2, 1 in rows and in columns, repeatedly. The edge pixel is repeated."""
     for axis in (0, 1) * times:
         plane = _sum_of_three(plane, axis, 2)
-        plane *= np.float32(1 / 4)
+    plane *= np.float32(1 / 16**times)
     return plane
 
 
@@ -205,28 +205,39 @@ def _sum_of_three(values: Array, axis: int, weight: int) -> Array:
     return total.swapaxes(0, axis)
 
 
+def _window_sums(values: Array, size: int, axis: int) -> Array:
+    """Return the sums of all windows of ``size`` lines along an axis, one for each that lies inside (n - size + 1)."""
+    lines = values.swapaxes(0, axis)
+    count, width, start = len(lines) - size + 1, 1, 0
+    parts = []  # a window consists of windows whose widths are powers of 2
+    while start < size:
+        if size & width:
+            parts.append(lines[start : start + count])
+            start += width
+        lines, width = lines[width:] + lines[:-width], 2 * width
+    return reduce(np.add, parts).swapaxes(0, axis)
+
+
 def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
     """Return the mean of the pixels up to ``reach`` rows and columns away, one plane (h, w) for each reach.
 
-    Pixels beyond the edge do not count. The time does not depend on the reach, because sums of the plane are stored
-    first (Crow 1984, *Summed-area tables for texture mapping*). They have 64 bits, so means below 1e-8 of the mean of
-    all pixels are not exact.
+    Pixels beyond the edge do not count.
     """
     height, width = plane.shape
-    sums = np.zeros((height + 1, width + 1))
-    np.cumsum(np.cumsum(plane, axis=1, dtype=np.float64), axis=0, out=sums[1:, 1:])
     results = [np.empty((height, width), np.float32) for _ in reaches]
 
     def work(rows: slice) -> None:
         for reach, result in zip(reaches, results, strict=True):
-            (top, bottom), (left, right) = (
-                (np.maximum(positions - reach, 0), np.minimum(positions + reach + 1, size))
-                for positions, size in ((np.arange(rows.start, rows.stop), height), (np.arange(width), width))
+            top, bottom = max(rows.start - reach, 0), min(rows.stop + reach, height)
+            margins = [(top - rows.start + reach, rows.stop + reach - bottom), (reach, reach)]
+            sums = np.pad(plane[top:bottom], margins)
+            for axis in (0, 1):
+                sums = _window_sums(sums, 2 * reach + 1, axis)
+            lines, columns = (
+                (np.minimum(places + reach + 1, size) - np.maximum(places - reach, 0)).astype(np.float32)
+                for places, size in ((np.arange(rows.start, rows.stop), height), (np.arange(width), width))
             )
-            lines = sums.take(bottom, axis=0) - sums.take(top, axis=0)
-            squares = lines.take(right, axis=1) - lines.take(left, axis=1)
-            squares *= 1 / (right - left)
-            np.multiply(squares, 1 / (bottom - top)[:, None], out=result[rows], casting="same_kind")
+            np.divide(sums, lines[:, None] * columns, out=result[rows])
 
-    for_row_blocks(work, height, 4 * width)
+    for_row_blocks(work, height, 2 * width)
     return results

@@ -26,6 +26,14 @@ def test_a_dark_region_beside_a_lamp_keeps_its_mean():
     np.testing.assert_allclose(means[50:], 1e-3, rtol=1e-4)
 
 
+def test_a_mean_is_not_below_0_beside_a_lamp():
+    """Its root is taken, which would be no number."""
+    rng = np.random.default_rng(2)
+    plane = np.zeros((48, 80), np.float32)
+    plane[:, 20:30], plane[10:14] = rng.random((48, 10)) ** 4, 0.1 * rng.random((4, 80))
+    assert means_around(plane, [3])[0].min() == 0
+
+
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 def test_means_are_exact_and_finite_up_to_the_largest_value(dtype):
     """Also where the sum of the pixels does not fit into their type."""

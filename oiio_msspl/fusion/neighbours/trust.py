@@ -264,8 +264,7 @@ def _halved(image: Array) -> Array:
 def _noise(lrhs: Array, hrls: Array, brightness: Array) -> Array:
     """Return the variance (h, w) of the mean of both renders (h, w, c), relative to the brightness."""
     squares = np.square(_limited((lrhs - hrls) / (2 * brightness))).mean(axis=-1)
-    (mean,) = means_around(squares, [NOISE_REACH])
-    return np.maximum(mean, 0)  # where both are equal, rounding can leave a mean below 0
+    return means_around(squares, [NOISE_REACH])[0]
 
 
 def _limited(differences: Array) -> Array:

@@ -8,10 +8,10 @@ import pytest
 
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.exr.render import Render, Window
-from oiio_msspl.fusion.neighbours import bands, trust
+from oiio_msspl.fusion.neighbours import bands
 from oiio_msspl.fusion.neighbours.average import average_renders as average
 from oiio_msspl.fusion.neighbours.renders import RenderPair, shared_noise
-from oiio_msspl.image.filters import box_downsample, means_around
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import limit_threads
 from tests.conftest import rgb, write_exr
 from tests.fusion.motion.moving_texture import HEIGHT, SCALE, WIDTH, hop, moved, rms, still, texture
@@ -259,16 +259,6 @@ def test_values_that_are_not_finite_bring_no_warning(monkeypatch):
     pairs[1].lr.layers["rgb"][::7, ::7] = np.inf
     with limit_threads(4):
         average_renders(pairs[0], [moved(pairs[1], 2.6, 0.8)], [])
-
-
-def test_noise_is_not_negative_where_both_renders_are_equal():
-    """Rounding leaves some sums below 0 there, and their root is no number."""
-    rng = np.random.default_rng(2)
-    squares = np.zeros((48, 80), np.float32)
-    squares[:, 20:30], squares[10:14] = rng.random((48, 10)) ** 4, 0.1 * rng.random((4, 80))
-    assert means_around(squares, [trust.NOISE_REACH])[0].min() < 0
-    difference = 2 * np.sqrt(squares)[..., None]
-    assert trust._noise(difference, np.zeros_like(difference), np.ones_like(difference)).min() == 0
 
 
 def test_the_variance_of_a_mean_is_smaller():

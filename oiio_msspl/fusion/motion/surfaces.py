@@ -29,6 +29,8 @@ PIXELS = 4
 #: It is also another one where most pixels differ, up to this number of rows and columns away: a texture that has moved
 #: has the same colour here and there by chance.
 AROUND, MOST = 8, 0.5
+#: Pixels are tested one by one if a smaller share of them differs.
+FEW = 0.05
 #: Rows and columns around a pixel that decide on it.
 REACH = 4 + AROUND
 #: Pixels by which vectors are judged, at most, and at least.
@@ -120,6 +122,9 @@ def _means_at(image: Array, x: Array, y: Array) -> Array:
 
 def _finite(values: Array) -> Array:
     """Return values with 0 in place of NaN and infinities."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        if np.isfinite(values.sum()):  # ten times as fast as a test of each
+            return values
     return np.where(np.isfinite(values), values, np.float32(0))
 
 
@@ -137,7 +142,7 @@ def _at_places(
     nearest = nearest_indices(x - place.x0, y - place.y0, (place.height, place.width))
     layers = {}
     for name, image in render.read(place, names).items():
-        planes = np.stack([plane.ravel().take(nearest) for plane in planes_of(image)])
+        planes = np.stack([plane.ravel().take(nearest, mode="clip") for plane in planes_of(image)])
         layers[name] = np.moveaxis(planes, 0, -1)
     return layers, inside
 
@@ -156,18 +161,32 @@ def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mas
         other = np.zeros((around.stop - around.start, width), np.bool_)
         for name, image in here.items():
             one, two = (_finite(planes_of(x[around])) for x in (image, there[name]))
-            least = np.float32(turn if name == NORMAL else DIFFERENCE)
-            limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + least
-            differs = _show_another(one, two, limit, (_distance(one, two) > limit) & compared[around])
-            other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
-        other |= means_around(other.astype(np.float32), [AROUND])[0] > MOST
-        result[rows] = grown(other)[first - around.start :][: last - first]
+            differs = _differing(one, two, turn if name == NORMAL else DIFFERENCE, compared[around])
+            if differs.any():
+                other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
+        if other.any():
+            other |= means_around(other.astype(np.float32), [AROUND])[0] > MOST
+            other = grown(other)
+        result[rows] = other[first - around.start :][: last - first]
 
     for_row_blocks(work, height, width)
     return result
 
 
-def _show_another(one: Array, two: Array, limit: Array, differs: Mask) -> Mask:
+def _differing(one: Array, two: Array, least: float, compared: Mask) -> Mask:
+    """Find the pixels (h, w) where planes (c, h, w) differ by more than ``least`` and by more than their roughness."""
+    distance = _distance(one, two)
+    differs = (distance > least) & compared
+    # The roughness takes long, so it is found only where pixels may show another surface, whatever it is.
+    if np.count_nonzero(differs) < FEW * differs.size:
+        differs = _show_another(one, two, np.float32(least), differs)
+    if np.count_nonzero(differs) >= PIXELS:
+        limit = np.maximum(_roughness(one), _roughness(two)) * np.float32(MULTIPLE) + np.float32(least)
+        differs = _show_another(one, two, limit, differs & (distance > limit))
+    return differs
+
+
+def _show_another(one: Array, two: Array, limit: Array | np.float32, differs: Mask) -> Mask:
     """Find which pixels that differ (h, w) show what is in neither of the 3 x 3 pixels around them in the other frame.
 
     At the edge of two surfaces a pixel with few samples shows the one or the other by chance.
@@ -184,7 +203,7 @@ def _show_another(one: Array, two: Array, limit: Array, differs: Mask) -> Mask:
             around = np.stack([other[place] for place in places])
             total += np.square(pixel[y, x] - np.clip(pixel[y, x], around.min(axis=0), around.max(axis=0)))
     result = np.zeros_like(differs)
-    result[y, x] = np.sqrt(outside.max(axis=0)) > limit[y, x]
+    result[y, x] = np.sqrt(outside.max(axis=0)) > np.broadcast_to(limit, differs.shape)[y, x]
     return result
 
 

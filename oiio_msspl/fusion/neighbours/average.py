@@ -27,6 +27,7 @@ from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS, Features, Rende
 from oiio_msspl.fusion.neighbours.results import Images, ResultBand, images_of
 from oiio_msspl.fusion.neighbours.trust import Judge, Light, RenderLight, ResultLight
 from oiio_msspl.image.arrays import Array, blank, unload
+from oiio_msspl.image.parallel import two_at_a_time
 
 #: Bytes for each pixel of the rows that are averaged at a time: of renders without their features, and of results.
 BYTES_OF_RENDERS, BYTES_OF_RESULTS = 56, 96
@@ -129,7 +130,7 @@ def _average(
     """Average a frame with its neighbours, band by band, and return the number of frames (h, w, 1)."""
     window = light.alignment.hr_data_window
     frames: Array = blank((window.height, window.width, 1))
-    sides = [(hops, _coarse_trust(light, hops, colours_of)) for hops in (before, after)]
+    sides = two_at_a_time(lambda hops: (hops, _coarse_trust(light, hops, colours_of)), (before, after))
 
     def work(core: Window, area: Window) -> None:
         band = band_of(core, area)

@@ -21,7 +21,7 @@ import numpy as np
 
 from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import blurred, box_downsample, max_around, means_around, upsample_linear
-from oiio_msspl.image.parallel import for_row_blocks
+from oiio_msspl.image.parallel import for_row_blocks, in_parallel, two_at_a_time
 
 #: Reach of the windows in which energies are compared, in LRHS pixels. Large windows find faint detail, small ones find
 #: where it ends. They hold fewer pixels, but also fewer kinds of noise.
@@ -94,7 +94,8 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     )
     if scale == 1:
         render = render + np.float32(renders.share) * (low - render)
-    factors = [_light_factor(*planes, renders.share, reach) for planes in zip(own, lrhs, means, strict=True)]
+    light = list(zip(own, lrhs, means, strict=True))
+    factors = two_at_a_time(lambda planes: _light_factor(*planes, renders.share, reach), light)
     picture = np.stack([_multiplied(*planes) for planes in zip(picture, factors, strict=True)])
     own = [plane * factor for plane, factor in zip(own, factors, strict=True)]
     energy, darker, brightness = _difference(picture, render, scale, exposure)
@@ -152,8 +153,10 @@ def _trust_in_detail(
     most = np.float32(LARGEST * scale**2)
     # Most windows lack rare light.
     dark = [share > MOSTLY for share in means_around(darker.astype(np.float32), sizes)]
-    areas = _trust_in_areas(energy, noise, dark, most, sizes)
-    both = _trust_of_both(common, change, darker, dark, sizes)
+    areas, both = in_parallel(
+        lambda: _trust_in_areas(energy, noise, dark, most, sizes),
+        lambda: _trust_of_both(common, change, darker, dark, sizes),
+    )
     points = _trust_in_points(energy, noise, darker, most, sizes[-1])
     return np.maximum(np.maximum(areas, both), points), points
 

@@ -130,7 +130,8 @@ def _average(
     """Average a frame with its neighbours, band by band, and return the number of frames (h, w, 1)."""
     window = light.alignment.hr_data_window
     frames: Array = blank((window.height, window.width, 1))
-    sides = two_at_a_time(lambda hops: (hops, _coarse_trust(light, hops, colours_of)), (before, after))
+    coarse_light = light.coarser()
+    sides = two_at_a_time(lambda hops: (hops, _coarse_trust(coarse_light, hops, colours_of)), (before, after))
 
     def work(core: Window, area: Window) -> None:
         band = band_of(core, area)

@@ -15,7 +15,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -94,6 +96,16 @@ class Light(ABC):
         self._share = self.cell**2 / PIXELS_AVERAGED
         lights = (image[..., 0] if image.shape[-1] == 1 else luminance(image) for image in (lrhs, hrls))
         self._least, self._most = _bounds(*lights)
+
+    def coarser(self) -> Self:
+        """Return the same light with cells of twice the size, for :meth:`coarse_trust`."""
+        light = copy(self)
+        light._halvings, light.cell, light._steps, light._share = (
+            self._halvings + 1, self.cell * 2, self._steps - 1, self._share * 4,
+        )  # fmt: skip
+        light._brightness, light._noise = _halved(self._brightness), _halved(self._noise) * np.float32(1 / 4)
+        light.shape = light._noise.shape
+        return light
 
     def cells(self, image: Array) -> Array:
         """Average an image over the grid (h, w, ...) to cells."""
@@ -174,6 +186,12 @@ class RenderLight(Light):
         super().__init__(alignment, lrhs, hrls, lrhs)
         self._renders = self.cells(lrhs), self.cells(hrls)
 
+    def coarser(self) -> Self:
+        """Return the same light with cells of twice the size."""
+        light = super().coarser()
+        light._renders = _halved(self._renders[0]), _halved(self._renders[1])
+        return light
+
     def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
         brightness = self._brightness[rows]
         low, high = (
@@ -201,6 +219,12 @@ class ResultLight(Light):
         doubt = self.cells(2 * luminance(picture) - lrhs - hrls) / luminance(self._brightness)
         #: 2 F - L - H, relative to the brightness.
         self._doubt = _limited(doubt)[..., None]
+
+    def coarser(self) -> Self:
+        """Return the same light with cells of twice the size."""
+        light = super().coarser()
+        light._picture, light._doubt = _halved(self._picture), _halved(self._doubt)
+        return light
 
     def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
         low = _limited((neighbour[0] - self._picture[rows]) / self._brightness[rows])

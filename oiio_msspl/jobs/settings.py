@@ -34,6 +34,7 @@ from oiio_msspl.wording import worded
 NOISE = {
     SPREAD: "the pixel filter has spread the noise over neighbouring pixels",
     CLEAN: "there is little noise",
+    SPREAD + CLEAN: "the pixel filter has spread the little noise there is over neighbouring pixels",
 }
 #: Bytes above which a size is a slip. Larger numbers are infinite as floats.
 LARGEST_MEMORY = 1 << 62
@@ -156,18 +157,18 @@ def family_for_noise(
     """Return the counterpart of a family that suits the noise of a pair, and the kind of noise.
 
     It is a key of ``NOISE``; "" for noise that needs no counterpart, and None without noise. Noise that the pixel
-    filter has spread needs weights of its own. Where there is little noise, a denoiser at full size that no other
-    network follows is more accurate. It needs a clean albedo and normal, except that of ``best`` for renders of one
-    size, which denoises them before. It predicts no ``error``.
+    filter has spread needs weights of its own. Where there is little noise, a denoiser of the HRLS at full size is more
+    accurate, which the LRHS only corrects; it predicts no ``error``. If noise is not spread, it needs a clean albedo
+    and normal, except that of ``best`` for renders of one size, which denoises them before.
     """
-    spread = is_noise_spread(lr, hr, alignment)
-    if spread:
-        return family + SPREAD, SPREAD
-    clean = None if error else for_little_noise(family)
-    denoises_aovs = family == QUALITIES["best"] and alignment.scale == ONE_SIZE
-    if clean and has_little_noise(lr, hr, alignment) and (denoises_aovs or has_clean_aovs(hr, alignment)):
-        return clean, CLEAN
-    return family, None if spread is None else ""
+    spread, scale = is_noise_spread(lr, hr, alignment), alignment.scale
+    kind = SPREAD if spread else ""
+    clean = None if error else for_little_noise(family + kind, scale)
+    if clean and has_little_noise(lr, hr, alignment, spread=bool(spread)):
+        denoises_aovs = spread or (family == QUALITIES["best"] and scale == ONE_SIZE)
+        if denoises_aovs or has_clean_aovs(hr, alignment):
+            return clean, kind + CLEAN
+    return family + kind, None if spread is None else kind
 
 
 def family_for_layers(hr: MappedRender, family: str) -> str:

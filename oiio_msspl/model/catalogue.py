@@ -55,9 +55,9 @@ def for_spread_noise(name: str) -> str | None:
     return family + SPREAD if any(model.startswith(f"{family}{SPREAD}-x") for model in models) else None
 
 
-def for_little_noise(family: str) -> str | None:
-    """Return the counterpart of a family for renders with little noise; None if there is none."""
-    return family + CLEAN if f"{family}{CLEAN}-x{ONE_SIZE}" in shipped_models() else None
+def for_little_noise(family: str, scale: int) -> str | None:
+    """Return the counterpart of a family for renders with little noise; None if there is none at a scale."""
+    return family + CLEAN if f"{family}{CLEAN}-x{scale}" in shipped_models() else None
 
 
 def find_model(scale: int, name: str | None = None) -> Path:
@@ -95,7 +95,7 @@ def model_files(scale: int, name: str | None = None) -> list[Path]:
     another one fuses passes at half of the frame's resolution.
     """
     path = find_model(scale, name)
-    fast_endings = {"": "", SPREAD: SPREAD, CLEAN: ""}
+    fast_endings = {"": "", SPREAD: SPREAD, CLEAN: "", SPREAD + CLEAN: SPREAD}
     endings = {WEIGHTS / f"{QUALITIES['best']}{ending}-x{scale}.onnx": fast for ending, fast in fast_endings.items()}
     if path not in endings:
         return [path]

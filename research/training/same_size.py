@@ -10,7 +10,9 @@ of both renders takes the place of the HRLS, and the mean at half of the size th
 With ``--clean``, it also writes the models for renders with little noise. ``joint-clean-x1.onnx`` is the denoiser of
 that mean alone, at full size. That of ``joint-large`` reads albedo and normal that are denoised before.
 ``joint-clean-x2.onnx`` and those at x4 and x8 denoise the HRLS by it, and the mean of both renders at the LRHS's size
-as the models do that they are made of. Then they draw the first picture towards the brightness of the second.
+as the models do that they are made of. Then they draw the first picture towards the brightness of the second. Noise
+that a filter has spread needs the whole model for one render, so ``joint-spread-clean-x2.onnx`` holds it, and there is
+no ``joint-spread-clean-x1.onnx``.
 
 Run :mod:`research.training.share` afterwards, so that the weights lie once.
 """
@@ -31,7 +33,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.model.contract import CLEAN, METADATA_KEY, ONE_SIZE, SCALES, Contract
+from oiio_msspl.model.contract import CLEAN, METADATA_KEY, ONE_SIZE, SCALES, SPREAD, Contract
 from oiio_msspl.model.devices import gpu_file
 from research.training.encoding import log_decode, log_encode
 from research.training.joint import MAX_RATIO
@@ -49,8 +51,9 @@ BYTES_PER_PIXEL = 1160
 #: Height and width at x2 of a pixel of the LRHS.
 SCALE = 2
 #: How far the denoised HRLS is drawn towards the brightness of both renders' denoised mean: if no sample of that mean
-#: is the LRHS's, and what is added if all of them are.
-DRAWN, DRAWN_BY_LRHS = 0.2, 0.8
+#: is the LRHS's, and what is added if all of them are. A wide filter blurs the LRHS more than the HRLS, so the second
+#: two numbers are for it, and means of 3 x 3 pixels are compared.
+DRAWN, DRAWN_SPREAD = (0.2, 0.8), (0.0, 0.3)
 #: Added to both sides of the ratio of their brightness, in exposed radiance: noise in the dark is no light.
 DARK = 0.02
 #: Prefix of tensors of the denoiser at full size, in the graph of a model for pairs with little noise.
@@ -100,11 +103,12 @@ class Draw(nn.Module):
 
     Args:
         scale: of the pair.
+        spread: a filter has spread the noise.
     """
 
-    def __init__(self, scale: int) -> None:
+    def __init__(self, scale: int, spread: bool) -> None:
         super().__init__()
-        self.scale = scale
+        self.scale, self.spread = scale, spread
 
     def forward(self, mean: Tensor, hrls: Tensor, share: Tensor) -> Tensor:
         """Draw the denoised HRLS (1, 3, s*h, s*w) towards the brightness of the denoised mean of both renders.
@@ -114,9 +118,13 @@ class Draw(nn.Module):
             share: of the LRHS in the mean.
         """
         picture = log_decode(hrls)
-        ratio = (log_decode(mean) + DARK) / (box_downsample(picture, self.scale) + DARK)
-        ratio = ratio.clamp(1 / MAX_RATIO, MAX_RATIO) ** (DRAWN + DRAWN_BY_LRHS * share)
+        ratio = (self._light(log_decode(mean)) + DARK) / (self._light(box_downsample(picture, self.scale)) + DARK)
+        least, by_lrhs = DRAWN_SPREAD if self.spread else DRAWN
+        ratio = ratio.clamp(1 / MAX_RATIO, MAX_RATIO) ** (least + by_lrhs * share)
         return log_encode(picture * upsample(ratio, self.scale, "bilinear"))
+
+    def _light(self, image: Tensor) -> Tensor:
+        return F.avg_pool2d(image, 3, 1, 1, count_include_pad=False) if self.spread else image
 
 
 def _mean(lrhs: Images, hrls: Images, shares: Images) -> Images:
@@ -156,7 +164,7 @@ def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:
 
     Args:
         path: of the `joint` model at the scale of the pairs.
-        one_size: the model of the family for renders of one size with little noise.
+        one_size: the model of the family for renders of one size: that for little noise, or for noise that is spread.
     """
     model, contract = onnx.load(path, load_external_data=False), Contract.of_file(path)
     family, _, scale = contract.name.rpartition("-x")
@@ -172,8 +180,10 @@ def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:
     graph.embed(one_size, OWN, inputs | {"fused": f"{OWN}fused"})
     inputs_of_draw = example(contract, 4 * contract.alignment, 6 * contract.alignment)
     images = tuple(inputs_of_draw[name] for name in ("lrhs.rgb", "hrls.rgb", "share.rgb"))
-    draw = traced(Draw(contract.scale), images, ["mean", "hrls", "share"], ["drawn"], contract.alignment)
-    names = {"mean": "mean.denoised", "hrls": f"{OWN}mean.denoised", "share": "share.rgb", "drawn": "encoded.fused"}
+    spread = family.endswith(SPREAD)
+    draw = traced(Draw(contract.scale, spread), images, ["mean", "hrls", "share"], ["drawn"], contract.alignment)
+    own = f"{OWN}{'encoded.fused' if spread else 'mean.denoised'}"
+    names = {"mean": "mean.denoised", "hrls": own, "share": "share.rgb", "drawn": "encoded.fused"}
     graph.embed(draw, "draw.", names)
     outputs = [value for value in model.graph.output if value.name != "log_error"]
     made = {name for node in graph.nodes for name in node.output}
@@ -245,10 +255,11 @@ def main() -> None:
     for source in filter(None, (args.model, gpu_file(args.model))):
         models = [same_size_model(source, clean=False)]
         if args.clean:
-            models.append(same_size_model(source, clean=True))
+            if not source.stem.endswith(f"{SPREAD}-x{SCALE}"):
+                models.append(same_size_model(source, clean=True))
             stem = source.stem.removesuffix(f"x{SCALE}")
             pairs = [source.with_name(f"{stem}x{scale}.onnx") for scale in SCALES]
-            models += [clean_pair_model(pair, models[1]) for pair in pairs]
+            models += [clean_pair_model(pair, models[-1]) for pair in pairs]
         for model in models:
             file = source.with_name(f"{model.graph.name}.onnx")
             onnx.save(model, file)

@@ -96,6 +96,23 @@ def test_renders_with_little_noise_have_a_model_of_their_own(tmp_path, quality, 
     assert f"{family}-x1" in open_exr(out).metadata["msspl/model"]
 
 
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize(("quality", "family"), [("balanced", "joint"), ("best", "joint-large")])
+def test_pairs_with_little_spread_noise_have_a_model_of_their_own(tmp_path, quality, family, scale):
+    """It has less of the error at little noise. At more noise the other one is taken."""
+    small, hr, out = tmp_path / "small.exr", tmp_path / "hr.exr", tmp_path / "out.exr"
+    for spp, ending in ((4096, "-spread-clean"), (4, "-spread")):
+        write_render(hr, 1, spp, sigma=0.5)
+        write_exr(small, rgb(spread(noisy(box_downsample(truth(), scale), spp * scale**2, seed=3), 0.5)))
+        report = fuse_files(small, hr, out, model=quality, overwrite=True)
+        assert report.model == f"{family}{ending}-x{scale}"
+        assert any("has spread the" in note for note in report.hr.notes)
+        if spp == 4096:
+            own = error(out)
+            fuse_files(small, hr, out, model=f"{family}-spread-x{scale}", overwrite=True)
+            assert own < error(out)
+
+
 @pytest.mark.parametrize(
     ("second", "message"),
     [

@@ -17,15 +17,18 @@ from oiio_msspl.model.encoding import encode_radiance, find_exposure
 #: Standard deviation of the noise in blocks, log-encoded, and the share of the blocks with less: the others may have
 #: texture. Path-traced rooms have this noise at some 16 to 32 spp.
 LITTLE, SMOOTH = 0.07, 0.25
+#: The same for noise that a filter has spread, for each HRLS pixel along a side of one of the LRHS: the wider these
+#: are, the less they tell of detail.
+LITTLE_SPREAD = 0.009
 #: Blocks of an AOV show edges or texture from this variance on. There, neighbouring pixels of clean AOVs correlate by
 #: more than the second number, in the mean: at 1, 2, 4, 8 and 16 spp by some 0.27, 0.37, 0.44, 0.47 and 0.50.
 EDGES, CLEAN = 1e-4, 0.46
 
 
-def has_little_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool:
+def has_little_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, spread: bool = False) -> bool:
     """Return whether an HRLS has little noise, or the mean of two renders of one size; one render is given as both.
 
-    Small samples all over the frame are read.
+    Small samples all over the frame are read. ``spread``: a filter has spread the noise over neighbouring pixels.
     """
     deviations, window, scale = [], alignment.hr_data_window, alignment.scale
     with hr.cache_strips(CACHE_BYTES), lr.cache_strips(CACHE_BYTES):
@@ -37,7 +40,7 @@ def has_little_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignmen
             image = encode_radiance(luminance(mean)[..., None], find_exposure(mean))[..., 0]
             deviations.append(noise_in(blocks_of(image)).std(axis=(1, 2)))
     found = np.concatenate(deviations)
-    return len(found) > 0 and bool(np.quantile(found, SMOOTH) < LITTLE)
+    return len(found) > 0 and bool(np.quantile(found, SMOOTH) < (LITTLE_SPREAD * scale if spread else LITTLE))
 
 
 def has_clean_aovs(hr: ReadableRender, alignment: Alignment) -> bool:

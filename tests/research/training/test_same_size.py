@@ -18,6 +18,7 @@ from research.training.same_size import Draw, clean_pair_model, same_size_model
 
 FAMILIES = [family + noise for family in QUALITIES.values() for noise in ("", SPREAD)]
 CLEAN_FAMILIES = [QUALITIES[quality] + CLEAN for quality in ("balanced", "best")]
+CLEAN_PAIRS = [*CLEAN_FAMILIES, *(QUALITIES[quality] + SPREAD + CLEAN for quality in ("balanced", "best"))]
 
 
 @pytest.mark.parametrize("family", [QUALITIES["fast"] + SPREAD, QUALITIES["best"], *CLEAN_FAMILIES])
@@ -28,11 +29,12 @@ def test_the_files_are_those_that_are_made_from_the_model_for_pairs(family):
 
 
 @pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("family", CLEAN_FAMILIES)
+@pytest.mark.parametrize("family", CLEAN_PAIRS)
 def test_the_files_for_pairs_with_little_noise_are_those_that_are_made(family, scale):
     pairs = WEIGHTS / f"{family.removesuffix(CLEAN)}-x{scale}.onnx"
     for path in (pairs, gpu_file(pairs)):
-        one_size = same_size_model(path.with_name(f"{family.removesuffix(CLEAN)}-x2.onnx"), clean=True)
+        at_x2 = path.with_name(f"{family.removesuffix(CLEAN)}-x2.onnx")
+        one_size = same_size_model(at_x2, clean=family in CLEAN_FAMILIES)
         _check_equal(path.with_name(f"{family}-x{scale}.onnx"), clean_pair_model(path, one_size))
 
 
@@ -68,13 +70,14 @@ def test_two_renders_are_denoised_together(family):
     assert error < error_of_one < 0.3 * noise
 
 
-def test_the_brightness_is_that_of_the_mean_where_all_of_its_samples_are_the_lrhs():
-    """With fewer of its samples, it is between that of the mean and that of the HRLS."""
+@pytest.mark.parametrize(("spread", "powers"), [(False, (1.0, 0.6)), (True, (0.3, 0.15))])
+def test_the_brightness_is_drawn_to_that_of_the_mean_by_the_share_of_the_lrhs(spread, powers):
+    """It is the mean's where all of its samples are the LRHS's, except if a filter has spread the noise."""
     scale = 2
     mean, hrls = (torch.full((1, 3, 8 * n, 8 * n), value) for n, value in ((1, 0.2), (scale, 0.1)))
-    mean[:, :, 2:] = 0.1
+    mean[:, :, 4:] = 0.1
     brightness = [
-        log_decode(Draw(scale)(log_encode(mean), log_encode(hrls), torch.tensor(share)))[0, 0, 0, 0]
+        log_decode(Draw(scale, spread)(log_encode(mean), log_encode(hrls), torch.tensor(share)))[0, 0, 0, 0]
         for share in (1.0, 0.5)
     ]
-    np.testing.assert_allclose(brightness, [0.1 * 0.22 / 0.12, 0.1 * (0.22 / 0.12) ** 0.6], rtol=1e-5)
+    np.testing.assert_allclose(brightness, [0.1 * (0.22 / 0.12) ** power for power in powers], rtol=1e-5)

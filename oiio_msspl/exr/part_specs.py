@@ -6,6 +6,7 @@ A description starts as a copy of the HRLS's part, so that windows and metadata 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -183,13 +184,9 @@ def share_attributes(specs: Sequence[Any], source: ExrFile) -> None:
 
 def runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
     """Cut channels of one pixel type where their indices are not neighbours: a run can be decoded in one call."""
-    run: list[Channel] = []
-    for channel in channels:
-        if run and channel.index != run[-1].index + 1:
-            yield tuple(run)
-            run = []
-        run.append(channel)
-    yield tuple(run)
+    # In a run, index and position grow together.
+    for _, run in itertools.groupby(enumerate(channels), lambda place: place[1].index - place[0]):
+        yield tuple(channel for _, channel in run)
 
 
 def _nuke_name(layer: str, view: str) -> str:

@@ -218,9 +218,7 @@ def _name_if_free(temporary: Path, target: Path) -> None:
     """Rename a file unless its target exists, so that two jobs don't overwrite each other."""
     try:
         os.link(temporary, target)
-    except FileExistsError:
-        raise
     except OSError:  # without hard links, two jobs that end in the same moment may overwrite each other
-        if target.exists():
+        if os.path.lexists(target):
             raise FileExistsError from None
         os.replace(temporary, target)

@@ -186,17 +186,13 @@ def _with_word(name: str, aov: str) -> list[str]:
 def aov_files(path: Path) -> set[Path]:
     """Find the files of AOVs beside the beauty ``path`` by names, without opening the beauty."""
     by_name = [entry for entry in renderers() if any(_holds_by_name(rule, path) for rule in entry["detect"])]
-    siblings = {sibling_of(path, name) for name in file_names(by_name)}
+    siblings = {sibling_of(path, name) for entry in by_name for name in file_names(entry)}
     common = renderers()[-1]
     layers = [entry_of(candidate).get("layer", "") for candidate in [*common[ALBEDO], *common[NORMAL]]]
     beside = {file_beside(path, name.removeprefix("beside:")) for name in layers if name.startswith("beside:")}
     return {file for file in siblings | beside if file}
 
 
-def file_names(entry: object) -> Iterator[str]:
-    """Yield NAME for every ``file:NAME`` in a candidate, a mapping, or an entry of the table."""
-    if isinstance(entry, str) and entry.startswith("file:"):
-        yield entry.removeprefix("file:")
-    elif isinstance(entry, Mapping | list):
-        for element in entry.values() if isinstance(entry, Mapping) else entry:
-            yield from file_names(element)
+def file_names(entry: Mapping[str, Any]) -> list[str]:
+    """Return NAME for every ``file:NAME`` in a mapping, or in an entry of the table."""
+    return [name.removeprefix("file:") for name in _names_in([*entry.values()]) if name.startswith("file:")]

@@ -52,9 +52,8 @@ def judged_vectors(
         frame and not clamped, alpha is not 0, they do not change too fast (:func:`_uneven`), and they are not zeros of
         a background (:func:`_doubtful_zeros`).
     """
-    window, frame = render.data_window, render.display_window
-    alpha = stored[..., 2] if render.alpha else None
-    vectors, known = decode(stored[..., :2], form, frame.width, frame.height, alpha)
+    window = render.data_window
+    vectors, known = _decoded(render, stored, form)
     inside = window.intersect(render.file.parts[channels[0].part].data_window)
     if inside != window:  # beyond the part's data window nothing is stored
         rendered = np.zeros_like(known)
@@ -66,18 +65,11 @@ def judged_vectors(
     return vectors, known
 
 
-def decode(
-    stored: Array, form: MotionFormat, width: int, height: int, alpha: Array | None = None
-) -> tuple[Array, Mask]:
-    """Decode vectors to pixels, x right and y down, and find where they can be believed.
-
-    Args:
-        stored: as the renderer wrote them, (h, w, 2).
-        form: how it stores them.
-        width, height: of the display window.
-        alpha: (h, w); None if the render has none.
-    """
-    vectors = np.empty(stored.shape, np.float32)
+def _decoded(render: MappedRender, stored: Array, form: MotionFormat) -> tuple[Array, Mask]:
+    """Decode vectors as :func:`judged_vectors` does, and find where their stored values can be believed."""
+    width, height = render.display_window.width, render.display_window.height
+    alpha = stored[..., 2] if render.alpha else None
+    vectors = np.empty((*stored.shape[:2], 2), np.float32)
     known = np.empty(stored.shape[:2], np.bool_)
 
     def work(rows: slice) -> None:
@@ -95,7 +87,7 @@ def decode(
                 squares += np.square(values)
             known[rows] = good & (squares < width**2 + height**2)  # false for NaN and infinities, too
 
-    for_row_blocks(work, len(stored), stored[0].size)
+    for_row_blocks(work, len(vectors), vectors[0].size)
     return vectors, known
 
 

@@ -8,7 +8,7 @@ have no operators, and in half floats in the second. The rest of both is float32
 from __future__ import annotations
 
 import os
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
@@ -50,8 +50,8 @@ def require_device(device: str) -> None:
     usable = usable_devices()
     if device in usable:
         return
-    package = PACKAGES[device]
-    if package != "onnxruntime" and _is_installed(package) and _is_installed("onnxruntime"):
+    package, installed = PACKAGES[device], {each.name for each in distributions()}
+    if package != "onnxruntime" and {package, "onnxruntime"} <= installed:
         raise InputError(
             f"--device {device}: the package onnxruntime has overwritten {package}; uninstall both with pip, then "
             f"install {package} again"
@@ -60,14 +60,6 @@ def require_device(device: str) -> None:
         f"--device {device}: the installed onnxruntime {runtime_version()} has no {PROVIDERS[device]}; "
         f"usable here: {', '.join(usable)}; to add {device}, install {package} in its place"
     )
-
-
-def _is_installed(package: str) -> bool:
-    try:
-        version(package)
-    except PackageNotFoundError:
-        return False
-    return True
 
 
 def providers(device: str) -> list[Provider]:

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnxruntime
@@ -75,10 +76,11 @@ def test_the_files_for_gpus_compute_the_same(family, scale):
 
 def test_onnxruntime_that_has_overwritten_the_package_for_gpus_is_named(monkeypatch):
     monkeypatch.setattr(devices, "usable_devices", lambda: ["cpu"])
-    monkeypatch.setattr(devices, "_is_installed", lambda package: True)
+    installed = [SimpleNamespace(name="onnxruntime"), SimpleNamespace(name="onnxruntime-gpu")]
+    monkeypatch.setattr(devices, "distributions", lambda: installed)
     with pytest.raises(InputError, match="onnxruntime has overwritten onnxruntime-gpu; uninstall both"):
         require_device("cuda")
-    monkeypatch.setattr(devices, "_is_installed", lambda package: package == "onnxruntime")
+    monkeypatch.setattr(devices, "distributions", lambda: installed[:1])
     with pytest.raises(
         InputError, match="has no CUDAExecutionProvider; usable here: cpu; to add cuda, install onnxruntime-gpu"
     ):

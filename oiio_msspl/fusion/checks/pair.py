@@ -132,7 +132,7 @@ def _judge(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> Judgem
         if not black.any():
             if np.count_nonzero(lit) > min(MOST_BY_CHANCE, lit.size // 2):
                 raise _black_beauty(black_name, lit_name)
-            return Judgement(not_judged=[_not_judged("anything: few samples find the light")])
+            return Judgement(not_judged=[Finding("not_judged", "anything: few samples find the light")])
     low = np.where(lost_low, high, low)
     scale, places = hrls.alignment.scale, (low, high)
     if scale == ONE_SIZE and min(low.shape) > 1:  # means over 2 x 2 pixels have less noise than renders of full size
@@ -211,7 +211,7 @@ def _judge_noise(judgement: Judgement, low: Array, hrls: HrlsAverages) -> None:
         )
         judgement.warnings.append(Finding("same_noise", text))
     elif same is None:
-        judgement.not_judged.append(_not_judged("whether the LRHS has noise of its own"))
+        judgement.not_judged.append(Finding("not_judged", "whether the LRHS has noise of its own"))
 
 
 def _looks_alike(judgement: Judgement, low: Array, high: Array, framing: Framing) -> bool:
@@ -223,7 +223,7 @@ def _looks_alike(judgement: Judgement, low: Array, high: Array, framing: Framing
     correlation, expected = correlations(*tone_mapped(low, high))
     said = f"correlation {correlation:.2f}, where their noise lets expect {expected:.2f}"
     if expected < VISIBLE:
-        judgement.not_judged.append(_not_judged("whether both show the same thing"))
+        judgement.not_judged.append(Finding("not_judged", "whether both show the same thing"))
     elif correlation < NO_PAIR:
         raise InputError(f"the two renders have nothing in common ({said}); give two of the same frame and camera")
     elif correlation < ALIKE * expected and not (framing.x or framing.y or framing.zoom):
@@ -251,9 +251,9 @@ def _judge_aovs(judgement: Judgement, aovs: Aovs, hrls: HrlsAverages) -> None:
         )
         judgement.warnings.append(Finding("negated_normal", text))
     elif agree is None and NORMAL in hrls.aovs:
-        judgement.not_judged.append(_not_judged("which way the normals point"))
+        judgement.not_judged.append(Finding("not_judged", "which way the normals point"))
     unclear = (aov for aov in (ALBEDO, NORMAL) if aov in hrls.aovs and aov not in aovs.judged)
-    judgement.not_judged += [_not_judged(f"the {aov}") for aov in unclear]
+    judgement.not_judged += [Finding("not_judged", f"the {aov}") for aov in unclear]
 
 
 def _judge_framing(judgement: Judgement, framing: Framing, alignment: Alignment, scale: int) -> None:
@@ -274,11 +274,7 @@ def _judge_framing(judgement: Judgement, framing: Framing, alignment: Alignment,
         )
         judgement.warnings.append(Finding("zoomed", text))
     if not framing.judged:
-        judgement.not_judged.append(_not_judged("the framing"))
-
-
-def _not_judged(what: str) -> Finding:
-    return Finding("not_judged", what)
+        judgement.not_judged.append(Finding("not_judged", "the framing"))
 
 
 def _direction(x: float, y: float, scale: int) -> str:

@@ -40,8 +40,7 @@ class StripKey(NamedTuple):
 class StripCache:
     """Decoded strips, up to a number of bytes.
 
-    Tiles are read row by row of tiles, and all tiles of such a row need the same strips. So a strip is kept until a
-    read needs other rows. A strip that does not fit is not kept: every tile decodes it again.
+    A strip is kept until a read needs other rows. One that does not fit is not kept: every tile decodes it again.
     """
 
     max_bytes: int = 0

@@ -36,12 +36,7 @@ LARGEST = 0.1
 #: Grey pictures have no primaries: P3 shifts their chromaticities by less than the root of this.
 LEAST_SHIFT = 1e-9
 
-_SPACES = {
-    "linear Rec.709": REC709,
-    "ACEScg": ACESCG,
-    "ACES2065-1": ACES2065,
-    "linear P3": P3,
-}
+_SPACES = {"linear Rec.709": REC709, "ACEScg": ACESCG, "ACES2065-1": ACES2065, "linear P3": P3}
 
 Colours = NDArray[np.float64]
 _TO_P3 = conversion(REC709, P3)

@@ -8,7 +8,7 @@ and denoisers that learnt from independent pixels take it for detail.
 from __future__ import annotations
 
 import functools
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,6 @@ from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance, find_exposure
-
-T = TypeVar("T", bound=np.generic)
 
 #: Side of the blocks in which neighbouring pixels are compared; and of a sample of the frame, in LRHS pixels.
 BLOCK, SAMPLE = 8, 32
@@ -84,7 +82,7 @@ def sample_windows(grid: Window) -> list[Window]:
     return [Window(x, y, x + width, y + height) for y in rows for x in columns]
 
 
-def blocks_of(image: NDArray[T]) -> NDArray[T]:
+def blocks_of(image: NDArray[Any]) -> NDArray[Any]:
     """Return the whole blocks of an image (h, w), (n, BLOCK^2)."""
     rows, columns = (side // BLOCK for side in image.shape)
     blocks = image[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, mirro
 from oiio_msspl.image.arrays import Array, planes_of
 from oiio_msspl.image.filters import box_downsample, max_3x3
 
-T = TypeVar("T", bound=np.generic)
 #: Albedo and normal without noise, of half or float.
 Guides = Mapping[str, NDArray[Any]]
 
@@ -213,7 +212,7 @@ def in_both(job: PassJob, count: int) -> NDArray[np.bool_]:
     return np.array([*shared, all(shared)])[:count]
 
 
-def estimated_of(job: PassJob, layers: NDArray[T]) -> NDArray[T]:
+def estimated_of(job: PassJob, layers: NDArray[Any]) -> NDArray[Any]:
     """Return those layers of :func:`dimmed`, on the first axis, that are to be estimated."""
     derived = [i for i, layer in enumerate(job.layers.layers) if layer in job.derived]
     return np.delete(layers, derived, axis=0) if derived else layers

@@ -20,41 +20,11 @@ from oiio_msspl.image.arrays import HALF_MAX, Array
 
 
 @dataclass(frozen=True)
-class FusedPixels:
-    """The fused beauty, and further layers such as ``error``.
+class FileContents:
+    """The input of a writer: the fused pixels, and the channels of the HRLS that are passed on.
 
     Rows are converted to the stored type as they are written: a second copy of an 8K frame takes half a gigabyte.
     """
-
-    rgb: Array
-    """Scene linear, (height, width, 3)."""
-    alpha: Array | None
-    """(height, width, 1), if the HRLS has an alpha."""
-    extra: Mapping[str, NDArray[Any]]
-    """Further layers, those of :data:`oiio_msspl.exr.write_options.COMPONENTS`, (height, width, channels) each."""
-    kind: str
-    """Pixel type in the file: ``half`` or ``float``."""
-
-    def rows(self, start: int, stop: int) -> NDArray[Any]:
-        """Return rows of the beauty as stored, (stop - start, width, 3 or 4)."""
-        values = self.rgb[start:stop]
-        if self.alpha is not None:
-            values = np.concatenate([values, self.alpha[start:stop]], axis=-1)
-        return self._stored(values)
-
-    def extra_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Return rows of a further layer as stored, (stop - start, width, channels)."""
-        return self._stored(self.extra[name][start:stop])
-
-    def _stored(self, values: NDArray[Any]) -> NDArray[Any]:
-        if self.kind == "half":
-            values = np.minimum(values, np.float32(HALF_MAX))
-        return np.ascontiguousarray(values, dtype=DTYPES[self.kind])
-
-
-@dataclass(frozen=True)
-class FileContents:
-    """The input of a writer: the fused pixels, and the channels of the HRLS that are passed on."""
 
     source: ExrFile
     """The HRLS."""
@@ -62,7 +32,12 @@ class FileContents:
     """Channels R, G, B and perhaps A of the HRLS, which the fused pixels replace; no alpha of another part."""
     dropped: frozenset[Channel]
     """Channels of the HRLS that are left out."""
-    pixels: FusedPixels
+    rgb: Array
+    """The fused beauty, scene linear, (height, width, 3)."""
+    alpha: Array | None
+    """Its alpha, (height, width, 1), if ``beauty`` has an A."""
+    extra: Mapping[str, NDArray[Any]]
+    """Further layers, those of :data:`oiio_msspl.exr.write_options.COMPONENTS`, (height, width, channels) each."""
     attributes: dict[str, str]
     """Header attributes that are added to the part of the beauty."""
     options: WriteOptions
@@ -89,6 +64,27 @@ class FileContents:
     def compression(self) -> str:
         """Compression of the fused beauty."""
         return self.options.compression or lossless(self.home)
+
+    @property
+    def kind(self) -> str:
+        """Pixel type of the fused beauty and the further layers: ``half`` or ``float``."""
+        return stored_type(self.beauty, self.options)
+
+    def rows(self, start: int, stop: int) -> NDArray[Any]:
+        """Return rows of the beauty as stored, (stop - start, width, 3 or 4)."""
+        values = self.rgb[start:stop]
+        if self.alpha is not None:
+            values = np.concatenate([values, self.alpha[start:stop]], axis=-1)
+        return self._stored(values)
+
+    def extra_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Return rows of a further layer as stored, (stop - start, width, channels)."""
+        return self._stored(self.extra[name][start:stop])
+
+    def _stored(self, values: NDArray[Any]) -> NDArray[Any]:
+        if self.kind == "half":
+            values = np.minimum(values, np.float32(HALF_MAX))
+        return np.ascontiguousarray(values, dtype=DTYPES[self.kind])
 
 
 def lossless(part: Part) -> str:

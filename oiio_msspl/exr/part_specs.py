@@ -65,7 +65,7 @@ def beauty_spec(contents: FileContents) -> Any:
         # The name of an only part says nothing; in the result, it would name a layer of plain channels.
         named = home.name and (len(contents.source.parts) > 1 or "." in contents.beauty[0].name)
         name, channels = home.name if named else "rgba", [channel.name for channel in contents.beauty]
-    spec = _spec(home, name, channels, contents.pixels.kind, contents.view)
+    spec = _spec(home, name, channels, contents.kind, contents.view)
     _compress(spec, contents.compression)
     for key, value in contents.attributes.items():
         spec.attribute(key, value)
@@ -76,7 +76,7 @@ def extra_spec(contents: FileContents, name: str, taken: set[str]) -> Any:
     """Describe the part of a further layer, and add its name to those that are ``taken``."""
     prefix = "" if contents.options.layout == "nuke" else f"{name}."
     channels = [f"{prefix}{component}" for component in COMPONENTS[name]]
-    spec = _spec(contents.home, _unique(name, taken), channels, contents.pixels.kind, contents.view)
+    spec = _spec(contents.home, _unique(name, taken), channels, contents.kind, contents.view)
     _drop_repeated_attributes(spec)
     _compress(spec, contents.compression)
     return spec

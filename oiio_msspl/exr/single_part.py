@@ -49,11 +49,11 @@ def write_single_part(path: Path, contents: FileContents) -> None:
 
 def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
     """Return the fused beauty and the further layers, (height, width) by channel name."""
-    height = contents.pixels.rgb.shape[0]
-    channels = dict(zip([c.name for c in contents.beauty], planes_of(contents.pixels.rows(0, height)), strict=True))
-    for name in contents.pixels.extra:
+    height = contents.rgb.shape[0]
+    channels = dict(zip([c.name for c in contents.beauty], planes_of(contents.rows(0, height)), strict=True))
+    for name in contents.extra:
         names = [f"{name}.{component}" for component in COMPONENTS[name]]
-        channels |= zip(names, planes_of(contents.pixels.extra_rows(name, 0, height)), strict=True)
+        channels |= zip(names, planes_of(contents.extra_rows(name, 0, height)), strict=True)
     return channels
 
 

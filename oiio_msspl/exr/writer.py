@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import not_written, replacing
-from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type, without_alpha_apart
+from oiio_msspl.exr.contents import FileContents, dropped_channels, without_alpha_apart
 from oiio_msspl.exr.part_specs import (
     PassedOnPart,
     beauty_spec,
@@ -63,7 +63,7 @@ def write_fused(
         rgb: scene linear, (height, width, 3), over the beauty's data window.
         alpha: (height, width, 1) if ``beauty`` has an A, otherwise None.
         attributes, replaced: see :class:`FileContents`.
-        extra: further layers, such as ``error``, see :attr:`FusedPixels.extra`.
+        extra: further layers, such as ``error``, see :attr:`FileContents.extra`.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit waits in temporary
             files.
         overwrite, before_rename: see :func:`oiio_msspl.exr.atomic.replacing`.
@@ -91,8 +91,7 @@ def write_fused(
             text = "the alpha has another data window than the beauty, so it is passed on as it is"
             warnings.append(Finding("no_alpha", text))
         alpha = None
-    pixels = FusedPixels(rgb, alpha, extra, stored_type(beauty, options))
-    contents = FileContents(source, colour, dropped, pixels, attributes, options, replaced)
+    contents = FileContents(source, colour, dropped, rgb, alpha, extra, attributes, options, replaced)
     with replacing(path, overwrite=overwrite, before_rename=before_rename) as temporary:
         if options.layout == "multilayer":
             write_single_part(temporary, contents)
@@ -111,7 +110,7 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
     """
     contents = _without_pixels(source, beauty, options, extra)
     kept = {layer.name for channel, layer in contents.layers.items() if channel not in contents.dropped}
-    if name := next((name for name in contents.pixels.extra if name in kept), None):
+    if name := next((name for name in contents.extra if name in kept), None):
         raise InputError(
             f"{OPTIONS[name]}: {source.path} has a layer '{name}' of its own; choose other layers with --layers, "
             "or leave the option out"
@@ -134,9 +133,8 @@ def _without_pixels(
 ) -> FileContents:
     """Describe by the headers alone what :func:`write_fused` would write."""
     nothing = np.empty((0, 0, 3), np.float32)
-    pixels = FusedPixels(nothing, None, dict.fromkeys(extra, nothing), stored_type(beauty, options))
-    dropped = dropped_channels(source, beauty, options.layers)
-    return FileContents(source, without_alpha_apart(beauty), dropped, pixels, {}, options)
+    dropped, layers = dropped_channels(source, beauty, options.layers), dict.fromkeys(extra, nothing)
+    return FileContents(source, without_alpha_apart(beauty), dropped, nothing, None, layers, {}, options)
 
 
 def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
@@ -144,7 +142,7 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     beauty = beauty_spec(contents)
     taken = {str(beauty.getattribute("oiio:subimagename"))}
     passed_on = list(passed_on_parts(contents, taken))
-    extra = {name: extra_spec(contents, name, taken) for name in contents.pixels.extra}
+    extra = {name: extra_spec(contents, name, taken) for name in contents.extra}
     specs = [beauty, *extra.values(), *(part.spec for part in passed_on)]
     share_attributes(specs, contents.source)
 
@@ -152,10 +150,10 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     if writer is None:
         raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
     ok = writer.open(str(path), specs if len(specs) > 1 else beauty)
-    ok = ok and _write_rows(writer, beauty, contents.pixels.rows)
+    ok = ok and _write_rows(writer, beauty, contents.rows)
     for name, spec in extra.items():
         ok = ok and writer.open(str(path), spec, "AppendSubimage")
-        ok = ok and _write_rows(writer, spec, partial(contents.pixels.extra_rows, name))
+        ok = ok and _write_rows(writer, spec, partial(contents.extra_rows, name))
     with contents.source.cache_strips(cache_bytes):
         for position, part in enumerate(passed_on, start=1):
             ok = ok and writer.open(str(path), part.spec, "AppendSubimage")

@@ -110,7 +110,7 @@ def check_no_input(
     pairs = {*shot.lr.files.values(), *shot.hr.files.values()}
     others = [inputs.files(path, model) for path in shot.hr.files.values()]
     folder, low = shot.output.folder, shot.lr.pattern.folder
-    if shot.output.number is shot.hr.pattern.number and folder.is_dir() and folder.samefile(low):
+    if shot.named_as_hr and folder.is_dir() and folder.samefile(low):
         raise InputError(f"{folder}: holds renders that this run reads; name another folder for the results")
     check_separate(pairs.union(*others), [*(path for frame in shot.frames for path in frame.targets), *more_targets])
 

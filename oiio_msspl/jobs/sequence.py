@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds the frames of a shot: numbered EXRs, by pattern or folder, paired by frame number.
 
-fileseq reads padding, frame ranges and the sequences of a folder. Where its reading differs from what compositors
-expect, a comment says so.
+fileseq reads padding and frame ranges. Where its reading differs from what compositors expect, a comment says so.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import itertools
 import os
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import fileseq
@@ -32,45 +31,29 @@ _NUMBER_FIELD = re.compile(r"##+|@@+|%\d+d|\$F\d*")
 _SHORT_FIELD = re.compile(r"(?<![^._ -])@(?![^._ -])|(%d|#)(?![^\W_])")
 
 #: A name whose number is not at its end, such as ``anim.0001_lr.exr``: head, number, tail. A number after a letter does
-#: not count: it may be a version or a size (``v002``, ``x2``). In ``a_v2.0001_lr.exr``, fileseq finds frame 2.
+#: not count: it may be a version or a size (``v002``, ``x2``).
 _NUMBER_INSIDE = re.compile(r"(|.*[._ -])(\d+)([_ -]\D*\.exr)", re.IGNORECASE)
 
-#: A name whose number is at its end. It may follow a letter (``hr0001.exr``), but not a ``v``, which marks a version.
-_NUMBER_LAST = re.compile(r"(|.*?[^vV\d])(\d+)(\.exr)", re.IGNORECASE)
-
-#: The end of a name before the number of a version.
-_VERSION = re.compile(r"(?<![^\W_])v$", re.IGNORECASE)
+#: A name whose number is at its end. It may follow a letter (``hr0001.exr``), but the number after a ``v`` that stands
+#: alone is that of a version (``still_v001.exr``).
+_NUMBER_LAST = re.compile(r"(.*?)(?<!\d)(?<!(?<![^\W_])v)(\d+)(\.exr)", re.IGNORECASE)
 
 #: What a sub-frame has beside its frame: ``.50`` in ``shot.1001.50.exr``.
 _SUB_FRAME = re.compile(r"(?<=\d)\.\d+(?=\.exr$)", re.IGNORECASE)
 
-#: One digit for a ``#``, as in Nuke, Katana and RV. fileseq's default is four digits.
-_PAD_STYLE = fileseq.constants.PAD_STYLE_HASH1
-
 
 @dataclass(frozen=True)
 class Pattern:
-    """The names of a sequence's files: ``head``, the padded frame number, ``tail``."""
+    """The names of a sequence's files: ``head``, the frame number with at least ``width`` characters, ``tail``."""
 
     folder: Path
     head: str
-    number: fileseq.FileSequence
-    """The padding (``####``) as a sequence of its own, which formats frame numbers."""
+    width: int
     tail: str
-
-    @classmethod
-    def padded(cls, folder: Path, head: str, width: int, tail: str) -> Pattern:
-        """Make a pattern whose numbers have at least ``width`` digits."""
-        return cls(folder, head, fileseq.FileSequence("#" * width, pad_style=_PAD_STYLE), tail)
 
     def path(self, number: int) -> Path:
         """Return the file of a frame."""
-        return self.folder / f"{self.head}{self.number.frame(number)}{self.tail}"
-
-    def spellings(self, number: int) -> set[str]:
-        """Return the spellings of a number: the sign of a negative one may count as a digit (-003) or not (-0003)."""
-        digits = self.number.frame(abs(number))
-        return {self.number.frame(number), digits if number >= 0 else f"-{digits}"}
+        return self.folder / f"{self.head}{number:0{self.width}}{self.tail}"
 
     @property
     def base(self) -> str:
@@ -80,7 +63,7 @@ class Pattern:
     @property
     def name(self) -> str:
         """The pattern without its folder, written with ``#``."""
-        return f"{self.head}{'#' * self.number.zfill()}{self.tail}"
+        return f"{self.head}{'#' * self.width}{self.tail}"
 
     def __str__(self) -> str:
         return str(self.folder / self.name)
@@ -130,6 +113,8 @@ class Shot:
     hr: Sequence
     output: Pattern
     frames: list[FrameFiles]
+    named_as_hr: bool = False
+    """Whether the output is a folder, whose files are named as those of the HRLS."""
 
     @property
     def has_one_render(self) -> bool:
@@ -138,7 +123,7 @@ class Shot:
 
     def target(self, number: int) -> Path:
         """Return the file of a fused frame. In a folder it is named as the HRLS, whose frames may differ in padding."""
-        if self.output.number is self.hr.pattern.number and number in self.hr.files:
+        if self.named_as_hr and number in self.hr.files:
             return self.output.folder / _with_exr(self.hr.files[number].name)
         return self.output.path(number)
 
@@ -188,7 +173,8 @@ def find_shot(
     else:
         low, high = _choose(found[0], found[1], Path(lr), Path(hr))
     numbers = sorted(low.files.keys() | high.files.keys()) if frames is None else parse_frames(frames)
-    shot = Shot(low, high, _output_pattern(Path(output), high.pattern), [])
+    is_pattern, pattern = _output_pattern(Path(output), high.pattern)
+    shot = Shot(low, high, pattern, [], named_as_hr=not is_pattern)
     shot.frames.extend(FrameFiles(n, low.files.get(n), high.files.get(n), shot.target(n)) for n in numbers)
     return shot
 
@@ -253,8 +239,9 @@ def parse_pattern(path: Path) -> Pattern:
     if len(fields) != 1:
         raise InputError(f"{path}: a pattern has its frame number in one place, such as name.####.exr or name.%04d.exr")
     start, end = fields[0].span()
-    number = fileseq.FileSequence(fields[0].group(), pad_style=_PAD_STYLE)
-    return Pattern(path.parent, path.name[:start], number, path.name[end:])
+    # One digit for a #, as in Nuke, Katana and RV. fileseq's default is four digits.
+    number = fileseq.FileSequence(fields[0].group(), pad_style=fileseq.constants.PAD_STYLE_HASH1)
+    return Pattern(path.parent, path.name[:start], number.zfill(), path.name[end:])
 
 
 def frame_in_name(path: Path) -> tuple[Pattern, int] | None:
@@ -263,7 +250,7 @@ def frame_in_name(path: Path) -> tuple[Pattern, int] | None:
     if match is None:
         return None
     head, number, width, tail = _numbered(match)
-    return Pattern.padded(path.parent, head, width, tail), number
+    return Pattern(path.parent, head, width, tail), number
 
 
 def next_file(path: Path) -> Path | None:
@@ -272,19 +259,17 @@ def next_file(path: Path) -> Path | None:
     if numbered is None:
         return None
     pattern, number = numbered
-    width = pattern.number.zfill()
-    # The sign of a negative number may count as a digit.
-    widths = (width, width + 1) if number < 0 else (width,)
-    files = (_files_of(Pattern.padded(pattern.folder, pattern.head, digits, pattern.tail)) for digits in widths)
-    return next((by_number[number + 1] for by_number in files if number + 1 in by_number), None)
+    # Frame 0 comes after -001 or after -0001.
+    patterns = (pattern, replace(pattern, width=pattern.width - 1)) if number < 0 else (pattern,)
+    return next((file for file in (each.path(number + 1) for each in patterns) if file.is_file()), None)
 
 
 def _numbered(match: re.Match[str]) -> tuple[str, int, int, str]:
-    """Return head, number, digits of the number, and tail of a name."""
+    """Return head, number, characters of the number, and tail of a name."""
     head, digits, tail = match.groups()
     # A hyphen after a letter or digit is a separator. Otherwise it is a sign.
     if head.endswith("-") and not head[-2:-1].isalnum():
-        return head[:-1], -int(digits), len(digits), tail
+        head, digits = head[:-1], f"-{digits}"
     return head, int(digits), len(digits), tail
 
 
@@ -316,8 +301,12 @@ def _files_of(pattern: Pattern) -> dict[int, Path]:
         if not (name.startswith(pattern.head) and name.endswith(pattern.tail)):
             continue
         text = name[len(pattern.head) : len(name) - len(pattern.tail)]
-        if re.fullmatch(r"-?\d+", text) and text in pattern.spellings(int(text)):
-            files[int(text)] = pattern.folder / name
+        if not re.fullmatch(r"-?\d+", text):
+            continue
+        number, width = int(text), pattern.width
+        # The sign of a negative number may count as a digit (-003) or not (-0003).
+        if text in (f"{number:0{width}}", f"-{abs(number):0{width}}"):
+            files[number] = pattern.folder / name
     return files
 
 
@@ -327,26 +316,17 @@ def _sequences_in(folder: Path) -> list[Sequence]:
     names = sorted(name for name in os.listdir(folder) if name.lower().endswith(".exr") and not name.startswith("."))
     frames = set(names)
     names = [name for name in names if _SUB_FRAME.sub("", name, count=1) not in frames - {name}]
-    inside = [match for match in map(_NUMBER_INSIDE.fullmatch, names) if match]
-    others = [name for name in names if not _NUMBER_INSIDE.fullmatch(name)]
+    matches = list(filter(None, map(_NUMBER_LAST.fullmatch, names)))
+    if not matches:
+        # Beside others, names with the number inside (anim.0001_lr.exr) may be files that belong to their frames.
+        matches = list(filter(None, map(_NUMBER_INSIDE.fullmatch, names)))
     by_name: dict[tuple[str, str], list[tuple[int, int, str]]] = {}
-    for sequence in fileseq.FileSequence.findSequencesInList(others, pad_style=_PAD_STYLE):
-        if sequence.frameSet() is None or _VERSION.search(sequence.basename()):
-            continue
-        for number, name in zip(map(int, sequence.frameSet() or ()), map(str, sequence), strict=True):
-            head, width = sequence.basename(), sequence.zfill()
-            # fileseq reads shot-0001.exr as frame -1. After a letter or digit the hyphen is a separator.
-            if number < 0 and head and head[-1].isalnum():
-                head, number, width = f"{head}-", -number, width - 1
-            # fileseq gives a sequence for each padding. One name with two paddings is refused below.
-            by_name.setdefault((head, sequence.extension()), []).append((number, width, name))
-    # Names with the number inside (anim.0001_lr.exr) may be files that belong to frames whose names end with it.
-    for match in [] if by_name else inside:
+    for match in matches:
         head, number, width, tail = _numbered(match)
         by_name.setdefault((head, tail), []).append((number, width, match[0]))
     sequences = []
     for (head, tail), members in sorted(by_name.items()):
-        pattern = Pattern.padded(folder, head, min(width for _, width, _ in members), tail)
+        pattern = Pattern(folder, head, min(width for _, width, _ in members), tail)
         files = {number: folder / name for number, _, name in members}
         if len(files) < len(members):
             raise InputError(f"{pattern}: some numbers occur with and without zeros in front; give a pattern")
@@ -404,17 +384,16 @@ def _width(path: Path) -> int:
     return 0 if "msspl/version" in file.metadata else file.display_window.width
 
 
-def _output_pattern(output: Path, hr: Pattern) -> Pattern:
-    """Return the names of the fused frames."""
-    if _number_fields(output.name) and not output.is_dir():
-        pattern = parse_pattern(output)
-        if not pattern.tail.lower().endswith(".exr"):
-            mark = _number_fields(output.name)[0].group()
-            raise InputError(
-                f"{output}: {mark} stands for the frame number, and the results are EXRs; name them .exr, or make the "
-                "folder first if it is one"
-            )
-        return pattern
-    if output.suffix.lower() == ".exr" and not output.is_dir():
+def _output_pattern(output: Path, hr: Pattern) -> tuple[bool, Pattern]:
+    """Return whether the output is a pattern, and not a folder, and the names of the fused frames."""
+    is_pattern = bool(_number_fields(output.name)) and not output.is_dir()
+    if output.suffix.lower() == ".exr" and not output.is_dir() and not is_pattern:
         raise InputError(f"{output}: one name for many frames; write {output.stem}.####.exr or name a folder")
-    return Pattern(output, hr.head, hr.number, _with_exr(hr.tail))
+    pattern = parse_pattern(output) if is_pattern else Pattern(output, hr.head, hr.width, _with_exr(hr.tail))
+    if not pattern.tail.lower().endswith(".exr"):
+        mark = _number_fields(output.name)[0].group()
+        raise InputError(
+            f"{output}: {mark} stands for the frame number, and the results are EXRs; name them .exr, or make the "
+            "folder first if it is one"
+        )
+    return is_pattern, pattern

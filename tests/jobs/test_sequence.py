@@ -205,7 +205,7 @@ def test_a_hyphen_after_a_letter_is_a_separator_and_a_sign_elsewhere(tmp_path):
     touch(tmp_path / "lr", "shot-0001.exr", "shot-0002.exr")
     touch(tmp_path / "hr", "a.-001.exr", "a.0002.exr")
     found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
-    assert (found.lr.pattern.name, list(found.lr.files)) == ("shot-####.exr", [2, 1])
+    assert (found.lr.pattern.name, list(found.lr.files)) == ("shot-####.exr", [1, 2])
     assert (found.hr.pattern.name, sorted(found.hr.files)) == ("a.####.exr", [-1, 2])
 
 

@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
+from functools import partial
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
@@ -29,7 +29,7 @@ from oiio_msspl.fusion.passes.layers import is_large, layer_names, lrhs_names, p
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array, Mask, kept
 from oiio_msspl.jobs.inputs import MappedPair, files_by_name, find_views, map_pair
-from oiio_msspl.jobs.memory import ViewMemory, light_features
+from oiio_msspl.jobs.memory import ViewMemory, budget_view, light_features
 from oiio_msspl.jobs.passes import Progress, check_layers, sets_to_fuse
 from oiio_msspl.jobs.plan import ShotPlan, ViewPlan
 from oiio_msspl.jobs.report import FrameReport
@@ -39,36 +39,20 @@ from oiio_msspl.jobs.timeline import Key
 from oiio_msspl.model.session import Session
 
 
-class State(IntEnum):
-    """How far a frame has come."""
-
-    FOUND = 0
-    """Its files are known."""
-    READ = 1
-    """Its pair is open and mapped. Its pixels are in memory, if there is room."""
-    AVERAGED = 2
-    """Its renders are averaged with those of its neighbours."""
-    FUSED = 3
-    """The network has fused it."""
-    SETTLED = 4
-    """Its picture is averaged with those of its neighbours, and its passes are fused."""
-    WRITTEN = 5
-    """Its EXR is on the disk."""
-
-
 class NoSuchView(InputError):
     """A frame lacks a view that other frames of the shot have."""
 
 
 @dataclass(eq=False)
 class ShotFrame:
-    """One view of a frame. ``state`` says which of its attributes are set."""
+    """One view of a frame. Its attributes are set one after the other, on its way from being found to being written."""
 
     files: FrameFiles
     view: str | None = None
     """The name of a view beside the first one; None for the first one, whose name may differ from frame to frame."""
     plan: ViewPlan = field(default_factory=ViewPlan)
-    state: State = State.FOUND
+    is_read: bool = False
+    """Whether its pair is open and mapped. Its pixels are then in memory, if there is room."""
     error: Exception | None = None
     """Why it did not come further."""
     warnings: list[Finding] = field(default_factory=list)
@@ -76,7 +60,7 @@ class ShotFrame:
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time by what it was spent on: ``read`` and ``fuse``."""
 
-    # From READ on
+    # Once it is read
     lr: MappedRender = field(init=False)
     hr: MappedRender = field(init=False)
     stored: tuple[MappedRender, MappedRender] = field(init=False)
@@ -94,7 +78,7 @@ class ShotFrame:
     passed_on: tuple[str, ...] = ()
     """Of the first view: why further views are not fused, one sentence each."""
 
-    # From AVERAGED on
+    # Once its renders are averaged with those of its neighbours
     averaged: RenderPair = field(init=False)
     """The means over neighbours; ``renders`` if there are none. Given up when the frame is fused."""
     means: tuple[Render, Render] | None = None
@@ -105,7 +89,7 @@ class ShotFrame:
     session: Session = field(init=False)
     """The model for the scale of the pair."""
 
-    # From FUSED on
+    # Once the network has fused it
     fused: FusedFrame | None = None
     """As the network fused it, for as long as a frame needs it."""
     replaced: ReplacedChannels | None = None
@@ -114,7 +98,7 @@ class ShotFrame:
     progress: Progress | None = None
     """Joins the progress of the parts of the work, if somebody wants to know it."""
 
-    # From SETTLED on
+    # Once its picture is averaged with those of its neighbours, and its passes are fused
     picture: FusedFrame | None = None
     """What is written, until it is."""
     report: FrameReport = field(init=False)
@@ -149,26 +133,26 @@ class ShotFrame:
         if self.error is not None:
             raise self.error
 
-    @property
-    def result(self) -> FusedFrame:
-        """``fused``, which is there."""
-        assert self.fused is not None
-        return self.fused
-
-    def require_state(self, state: State) -> ShotFrame:
-        """Return this frame, or raise why it has not come so far that a neighbour can be averaged with it.
+    def as_neighbour(self, is_usable: bool) -> ShotFrame:
+        """Return this frame if a neighbour can be averaged with it. Otherwise raise why it has not come so far.
 
         Raises:
             InputError: its files can't be used, so it is left out in every run.
             MssplError: it has failed otherwise, such as for a full disk. Without it, the neighbour would have other
                 pixels than in another run.
         """
-        if self.state >= state:
+        if is_usable:
             return self
         assert self.error is not None
         if isinstance(self.error, InputError):
             raise self.error
         raise MssplError(f"frame {self.number}, its neighbour, has failed: {explain(self.error)[0]}") from self.error
+
+    @property
+    def result(self) -> FusedFrame:
+        """``fused``, which is there."""
+        assert self.fused is not None
+        return self.fused
 
     def read_if_small(self) -> RenderPair:
         """Return the renders. Those of a small frame are decoded once, with the passes to fuse, into memory.
@@ -224,10 +208,10 @@ def read_frame(files: FrameFiles, settings: Settings, plan: ShotPlan, *, only_fr
             with frame.attempt():
                 if not only_frame:
                     _read_pixels(frame)
-                frame.state = State.READ
+                frame.is_read = True
         first.seconds["read"] = time.perf_counter() - start
     for frame in frames[1:]:
-        if frame.state < State.READ and frame.error is None:
+        if not frame.is_read and frame.error is None:
             frame.error = first.error or NoSuchView(f"it has no pair for {name_of(frame.view or '')}")
     return frames
 
@@ -246,7 +230,7 @@ def _open(frames: Sequence[ShotFrame], settings: Settings) -> list[ShotFrame]:
     pairs[None] = views[0]
     present = [frame for frame in frames if frame.view in pairs]
     planned = {frame.view for frame in frames}
-    first.others = [ShotFrame(files, name, state=State.READ) for name in pairs if name not in planned]
+    first.others = [ShotFrame(files, name, is_read=True) for name in pairs if name not in planned]
     for frame in (*present, *first.others):
         _set_pair(frame, *pairs[frame.view], settings)
     return present
@@ -263,7 +247,7 @@ def _set_pair(frame: ShotFrame, lr: MappedRender, hr: MappedRender, settings: Se
 
 def _budget(frames: Sequence[ShotFrame], settings: Settings, *, missing: int) -> None:
     """Budget the memory of each view that is there. Of those that are ``missing``, other frames may wait."""
-    memories = []
+    budgets = []
     for frame in frames:
         low, high = frame.stored
         try:  # a file may have many more features than the model reads, and decoding them all is slow
@@ -271,12 +255,12 @@ def _budget(frames: Sequence[ShotFrame], settings: Settings, *, missing: int) ->
         except InputError:  # the model can't be loaded, which ends the job when it is needed
             features = [*HRLS_FEATURES, "alpha"]
         features += light_features(high)
-        most = settings.max_memory
-        memories.append(ViewMemory(low, high, features, frame.plan, frame.write.error_layer, most))
-    waiting = [memory.waiting for memory in memories]
+        most, error = settings.max_memory, frame.write.error_layer
+        budgets.append(partial(budget_view, low, high, features, frame.plan, error=error, max_memory=most))
+    waiting = [budget().waiting for budget in budgets]
     total = sum(waiting) + missing * max(waiting)
-    for frame, memory, own in zip(frames, memories, waiting, strict=True):
-        frame.memory = replace(memory, other_views=total - own)
+    for frame, budget, own in zip(frames, budgets, waiting, strict=True):
+        frame.memory = budget(other_views=total - own)
 
 
 def features_read(session: Session) -> list[str]:
@@ -287,20 +271,20 @@ def features_read(session: Session) -> list[str]:
 def _read_pixels(frame: ShotFrame) -> None:
     """Read the pixels of a view if the frames that live fit into memory beside a tile."""
     start = time.perf_counter()
-    memory = frame.memory
+    memory, (low, high) = frame.memory, frame.stored
     assert memory is not None
-    if memory.plan.reach.frames:
+    if frame.plan.reach.frames:
         # A damaged frame is left out by its neighbours, whether its pixels and vectors wait in memory or not.
         if not memory.fits:
-            memory.hr.check_pixels(memory.motion_channels, memory.features)
-            memory.lr.check_pixels((), memory.features)
+            high.check_pixels(memory.motion_channels, memory.features)
+            low.check_pixels((), memory.features)
         elif memory.motion_channels and not memory.vectors_ahead:
-            memory.hr.check_pixels(memory.motion_channels, ())
+            high.check_pixels(memory.motion_channels, ())
     if memory.fits:
         motion, channels = frame.plan.motion, memory.vectors_ahead
-        high, stored = memory.hr.load_with(channels, memory.features, on_disk=memory.on_disk)
-        vectors = motion.vectors_of(frame.hr, high, stored) if motion and channels else {}
+        loaded, stored = high.load_with(channels, memory.features, on_disk=memory.on_disk)
+        vectors = motion.vectors_of(frame.hr, loaded, stored) if motion and channels else {}
         frame.vectors = {direction: (kept(pixels), kept(mask)) for direction, (pixels, mask) in vectors.items()}
-        low = high if memory.lr is memory.hr else memory.lr.load(memory.features, on_disk=memory.on_disk)
-        frame.renders = RenderPair(low, high)
+        loaded_low = loaded if low is high else low.load(memory.features, on_disk=memory.on_disk)
+        frame.renders = RenderPair(loaded_low, loaded)
     frame.seconds["read"] = time.perf_counter() - start

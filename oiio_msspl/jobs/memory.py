@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
@@ -35,107 +34,74 @@ READ_VECTOR_BYTES = 12
 
 @dataclass(frozen=True)
 class ViewMemory:
-    """The memory of a view of a shot whose frames are all like this one."""
+    """The memory of a view of a shot whose frames are all like one."""
 
-    lr: MappedRender
-    hr: MappedRender
-    """The pair, with the light of its passes if renders are averaged with those of neighbours."""
     features: Sequence[str]
     """The features to read, where the pair has them."""
-    plan: ViewPlan
-    error: bool
-    """Whether the expected error is computed."""
-    max_memory: int
-    """What the process should stay below."""
-    other_views: int = 0
+    motion_channels: list[Channel]
+    """The channels of the motion vectors; none if the motion is known otherwise."""
+    fits: bool
+    """Whether there is room for the pixels of all frames that live, beside a tile and two results."""
+    on_disk: bool
+    """Whether waiting renders are spilled to temporary files: always when several views are averaged, otherwise only if
+    a large frame and its motion vectors do not fit into memory."""
+    vectors_ahead: list[Channel]
+    """The motion vectors to read with the pixels. If they do not fit beside these, they are read later."""
+    held: int
+    """Memory of other frames while one is fused: the pixels of the next one, the result of the previous one, and
+    neighbours."""
+    waiting: int
+    """The most memory that the frames of this view take while another view is fused."""
+    other_views: int
     """What frames of other views take while this one is fused."""
 
-    @cached_property
-    def fits(self) -> bool:
-        """Whether there is room for the pixels of all frames that live, beside a tile and two results."""
-        return self._room(self._frames_in_memory) >= 0
 
-    @cached_property
-    def on_disk(self) -> bool:
-        """Whether waiting renders are spilled to temporary files: always when several views are averaged, otherwise
-        only if a large frame and its motion vectors do not fit into memory."""
-        if not self.plan.reach.renders:
-            return False
-        if self.other_views:
-            return True
-        return is_large(self.hr) and self._room(self._frames_alive) < _vector_bytes(self.hr, self.motion_channels)
+def budget_view(
+    lr: MappedRender,
+    hr: MappedRender,
+    features: Sequence[str],
+    plan: ViewPlan,
+    *,
+    error: bool,
+    max_memory: int,
+    other_views: int = 0,
+) -> ViewMemory:
+    """Budget the memory of a view.
 
-    @cached_property
-    def vectors_ahead(self) -> list[Channel]:
-        """The motion vectors to read with the pixels. If they do not fit beside these, they are read later."""
-        channels = self.motion_channels
-        return channels if _vector_bytes(self.hr, channels) <= self._room(self._frames_in_memory) else []
+    Args:
+        lr, hr: the pair, with the light of its passes if renders are averaged with those of neighbours.
+        features: those to read, where the pair has them.
+        plan: of the view.
+        error: whether the expected error is computed.
+        max_memory: what the process should stay below.
+        other_views: see :class:`ViewMemory`.
+    """
+    alignment, reach = align(lr, hr), plan.reach
+    channels = plan.motion.channels(hr) if plan.motion else []
+    result, vectors = result_bytes(alignment, error=error), _vector_bytes(hr, channels)
+    # Frames whose pixels live: the one that is fused, its neighbours, and the next one to come.
+    pixels = (2 * reach.renders + 2) * sum(_pixel_bytes(render, features) for render in (lr, hr))
+    waiting, averaging = memory_to_average(reach, hr.data_window, _channels(hr, features), alignment.scale)
+    waiting += _waiting_means(lr, hr, reach)
+    held = result + waiting + averaging + other_views
+    room = max_memory - FIXED_MEMORY - TILE_MEMORY - _pixel_bytes(lr, features) - result - held
+    on_disk = reach.renders > 0 and (other_views > 0 or (is_large(hr) and room - pixels < vectors))
+    in_memory = 0 if on_disk else pixels
+    fits = room >= in_memory
+    vectors_ahead = channels if vectors <= room - in_memory else []
+    if fits:
+        held += in_memory + _vector_bytes(hr, vectors_ahead)
+    # Renders that are averaged wait in temporary files, because several views are.
+    waiting += 0 if reach.renders else pixels
+    return ViewMemory(features, channels, fits, on_disk, vectors_ahead, held, waiting, other_views)
 
-    @cached_property
-    def held(self) -> int:
-        """Memory of other frames while one is fused: the pixels of the next one, the result of the previous one, and
-        neighbours."""
-        held = self._result + self._averaging + self.other_views
-        if self.fits:
-            held += self._frames_in_memory * self._pair + _vector_bytes(self.hr, self.vectors_ahead)
-        return held
 
-    @cached_property
-    def waiting(self) -> int:
-        """The most memory that the frames of this view take while another view is fused."""
-        waiting = self._to_average[0] + self._waiting_means
-        # Renders that are averaged wait in temporary files, because several views are.
-        return waiting if self.plan.reach.renders else waiting + self._frames_alive * self._pair
-
-    @cached_property
-    def motion_channels(self) -> list[Channel]:
-        """The channels of the motion vectors; none if the motion is known otherwise."""
-        return self.plan.motion.channels(self.hr) if self.plan.motion else []
-
-    def _room(self, frames: int) -> int:
-        """Memory that is left beside the pixels of ``frames`` frames; negative if they don't fit."""
-        rest = FIXED_MEMORY + TILE_MEMORY + 2 * self._result + _pixel_bytes(self.lr, self.features)
-        return self.max_memory - rest - self._averaging - self.other_views - frames * self._pair
-
-    @property
-    def _frames_alive(self) -> int:
-        """Frames whose pixels live: the one that is fused, its neighbours, and the next one to come."""
-        return 2 * self.plan.reach.renders + 2
-
-    @property
-    def _frames_in_memory(self) -> int:
-        return 0 if self.on_disk else self._frames_alive
-
-    @cached_property
-    def _alignment(self) -> Alignment:
-        return align(self.lr, self.hr)
-
-    @cached_property
-    def _result(self) -> int:
-        return result_bytes(self._alignment, error=self.error)
-
-    @cached_property
-    def _pair(self) -> int:
-        return sum(_pixel_bytes(render, self.features) for render in (self.lr, self.hr))
-
-    @property
-    def _averaging(self) -> int:
-        """Memory of averaging, and of means that wait for their passes to be fused."""
-        return sum(self._to_average) + self._waiting_means
-
-    @cached_property
-    def _to_average(self) -> tuple[int, int]:
-        channels = _channels(self.hr, self.features)
-        return memory_to_average(self.plan.reach, self.hr.data_window, channels, self._alignment.scale)
-
-    @cached_property
-    def _waiting_means(self) -> int:
-        """Memory of averaged renders that wait for their passes to be fused. Large ones wait in temporary files."""
-        if not light_features(self.hr) or is_large(self.hr):
-            return 0
-        renders = (self.lr, self.hr)
-        bytes_of_pair = sum(_pixel_bytes(render, [RGB, ALBEDO, NORMAL, *light_features(render)]) for render in renders)
-        return (self.plan.reach.results + 2) * bytes_of_pair
+def _waiting_means(lr: MappedRender, hr: MappedRender, reach: Reach) -> int:
+    """Return what averaged renders take that wait for their passes to be fused. Large ones wait in temporary files."""
+    if not light_features(hr) or is_large(hr):
+        return 0
+    bytes_of_pair = sum(_pixel_bytes(render, [RGB, ALBEDO, NORMAL, *light_features(render)]) for render in (lr, hr))
+    return (reach.results + 2) * bytes_of_pair
 
 
 def memory_to_average(reach: Reach, window: Window, channels: int, scale: int) -> tuple[int, int]:

@@ -39,7 +39,7 @@ from oiio_msspl.fusion.tiles.tiling import require_memory, strips_memory
 from oiio_msspl.image.arrays import HALF_MAX, kept
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.existing import ExistingResults
-from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State, features_read, read_frame
+from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, features_read, read_frame
 from oiio_msspl.jobs.memory import check_frame_memory, light_features
 from oiio_msspl.jobs.passes import Progress, costs_of, sets_to_fuse
 from oiio_msspl.jobs.plan import ShotPlan
@@ -136,21 +136,19 @@ class ShotRun:
             frame.averaged = frame.read_if_small() if self._only_frame else frame.renders
             if frame.plan.reach.renders:
                 self._average_renders(frame)
-            frame.state = State.AVERAGED
             if self._tell is not None:
                 views = [view.hr for view in (*frame.others, frame)]
                 frame.progress = Progress(self._tell, costs_of(views, frame.session, frame.write))
             if frame.number in self._wanted:
                 self._fuse_others(frame)
             frame.fused = self.fuse(frame)
-            frame.state = State.FUSED
             if frame.plan.reach.results:
                 frame.keep_result()
         frame.seconds["fuse"] = time.perf_counter() - start
 
     def _average_renders(self, frame: ShotFrame) -> None:
         """Put the means over neighbours in the place of a frame's renders, and keep what its passes are fused from."""
-        before, after = self._hops(frame, "renders", lambda other: other.require_state(State.READ).renders)
+        before, after = self._hops(frame, "renders", lambda other: other.as_neighbour(other.is_read).renders)
         if not (before or after):
             return
         lacking = any(lacking_passes(frame.renders, hop.frame) for hop in (*before, *after))
@@ -230,7 +228,6 @@ class ShotRun:
             busy = sum(frame.seconds["fuse"] for frame in views) + time.perf_counter() - start
             network = first.report.network_seconds
             first.report.seconds = {"read": first.seconds["read"], "fuse": busy, "network": network}
-            first.state = State.SETTLED
 
     def _report(self, first: ShotFrame, picture: FusedFrame, others: Sequence[ShotFrame]) -> FrameReport:
         """Report on a frame that is settled: its first view with the final picture, and its other views."""
@@ -251,7 +248,7 @@ class ShotRun:
         picture = frame.result
         if not self.plan.count:
             return picture
-        before, after = self._hops(frame, "results", lambda other: other.require_state(State.FUSED).result)
+        before, after = self._hops(frame, "results", lambda other: other.as_neighbour(other.fused is not None).result)
         warnings = list(dict.fromkeys([*picture.warnings, *frame.warnings]))
         if before or after:
             picture = average_results(picture, before, after)
@@ -300,7 +297,7 @@ class ShotRun:
             if key not in renders | pictures:
                 del self._frames[key]
                 continue
-            if key not in renders and frame.state >= State.READ:
+            if key not in renders and frame.is_read:
                 frame.renders = RenderPair(*frame.stored)  # the files can still be read
             if key not in pictures:
                 frame.fused = None

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from oiio_msspl.image import parallel
 from oiio_msspl.jobs import frame as reading
 from oiio_msspl.jobs import memory
 from oiio_msspl.jobs import run as run_module
-from oiio_msspl.jobs.memory import ViewMemory, memory_to_average
+from oiio_msspl.jobs.memory import budget_view, memory_to_average
 from oiio_msspl.jobs.plan import AUTO_COUNT, ShotPlan, TemporalOptions, ViewPlan, plan_temporal, reach_of
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, find_shot
@@ -261,7 +262,11 @@ def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models,
     folder = make_moving_shot(tmp_path, count=4)
     damaged = folder / "hr/hr.1003.exr"
     damaged.write_bytes(damaged.read_bytes()[:-2000])
-    monkeypatch.setattr(ViewMemory, "fits", in_memory)
+
+    def budget(*view, **more):
+        return replace(budget_view(*view, **more), fits=in_memory)
+
+    monkeypatch.setattr(reading, "budget_view", budget)
     report = fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
     assert [report.results[n].status for n in range(1001, 1005)] == ["fused", "fused", "failed", "fused"]
     assert any("frame 1003 is not averaged" in text for text in report.results[1002].warnings)

@@ -2,6 +2,7 @@
 """Each view and view layer of a shot is averaged with its own neighbours."""
 
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from oiio_msspl import InputOptions, WriteOptions, fuse_shot
 from oiio_msspl.jobs import frame as reading
 from oiio_msspl.jobs.frame import read_frame
-from oiio_msspl.jobs.memory import ViewMemory
+from oiio_msspl.jobs.memory import budget_view
 from oiio_msspl.jobs.plan import ShotPlan, TemporalOptions, ViewPlan
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Reach
@@ -232,7 +233,11 @@ def test_a_damaged_view_is_absent_wherever_renders_wait(tmp_path, bilinear_model
     cut_part(path, view)
     results = []
     for name, fits in (("in memory", True), ("in files", False)):
-        monkeypatch.setattr(ViewMemory, "fits", fits)
+
+        def budget(*view, fits=fits, **more):
+            return replace(budget_view(*view, **more), fits=fits)
+
+        monkeypatch.setattr(reading, "budget_view", budget)
         out = shot / name
         out.mkdir()
         options = TemporalOptions("auto")

@@ -38,10 +38,6 @@ class ExistingResults:
         """Return whether a frame counts as done: its EXR exists and is not to be replaced."""
         return self.settings.skip_existing and files.output.is_file() and not self.replaces(files)
 
-    def has(self, files: FrameFiles) -> bool:
-        """Return whether a frame has an EXR that is not to be replaced, whoever wrote it."""
-        return files.output.exists() and not self.replaces(files)
-
     def replaces(self, files: FrameFiles) -> bool:
         """Return whether an EXR that exists is replaced: always, or if an input is newer than it."""
         return self.settings.overwrite or (self.settings.update and bool(self.newer_inputs(files)))

@@ -95,7 +95,10 @@ def fuse_frames(
     run = uuid.uuid4().hex
     #: The chunks under way, and how often a frame of a chunk may still be tried again.
     futures: dict[Future, tuple[list[FrameFiles], int]] = {}
-    settings, plan = replace(settings, inputs=settings.inputs.absolute()), plan.absolute()
+    # skip_existing lets a task that runs again keep its frames, and replace the preview that a dead worker left without
+    # its EXR.
+    settings = replace(settings, inputs=settings.inputs.absolute(), skip_existing=True)
+    plan = plan.absolute()
     existing = ExistingResults(settings, plan)
 
     def submit(chunk: list[FrameFiles], tries: int) -> Future:
@@ -127,7 +130,7 @@ def fuse_frames(
                 failure = error
             if failure is not None:
                 # Frames of the chunk that were written before are complete.
-                yield from ((frame, None if existing.has(frame) else failure) for frame in chunk)
+                yield from ((frame, None if existing.skips(frame) else failure) for frame in chunk)
     finally:
         client.cancel(list(futures))
 
@@ -159,15 +162,11 @@ def _fuse_chunk(run: str, settings: Settings, plan: ShotPlan, frames: list[Frame
 
     threads = settings.threads or (max(1, CPU_COUNT // workers) if workers > 1 else 0)
     use_threads(threads)
-    # skip_existing lets a frame replace the preview that a dead worker left without its EXR.
-    settings = replace(settings, threads=threads, skip_existing=True, sessions=_sessions(run))
+    settings = replace(settings, threads=threads, sessions=_sessions(run))
     existing = ExistingResults(settings, plan)
     outcomes: dict[int, Outcome] = {}
     # There was no EXR when the run began (or it may be replaced), so another try or another worker has written it.
-    missing = [frame for frame in frames if not existing.has(frame)]
+    missing = [frame for frame in frames if not existing.skips(frame)]
     if missing:
         run_pipeline(ShotRun(settings, plan, missing), lambda frame, outcome: outcomes.update({frame.number: outcome}))
-    # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
-    failed = {n for n, outcome in outcomes.items() if isinstance(outcome, InputError)}
-    written = {frame.number for frame in frames if frame.number in failed and existing.has(frame)}
-    return [None if frame.number in written else outcomes.get(frame.number) for frame in frames]
+    return [outcomes.get(frame.number) for frame in frames]

@@ -16,14 +16,13 @@ from functools import partial
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
-from oiio_msspl.errors import InputError, MssplError, explain
+from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.motion.source import MotionFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.passes.layers import is_large, layer_names, lrhs_names, pass_features, with_light
 from oiio_msspl.fusion.tiles.alignment import align
@@ -133,27 +132,6 @@ class ShotFrame:
         if self.error is not None:
             raise self.error
 
-    def as_neighbour(self, is_usable: bool) -> ShotFrame:
-        """Return this frame if a neighbour can be averaged with it. Otherwise raise why it has not come so far.
-
-        Raises:
-            InputError: its files can't be used, so it is left out in every run.
-            MssplError: it has failed otherwise, such as for a full disk. Without it, the neighbour would have other
-                pixels than in another run.
-        """
-        if is_usable:
-            return self
-        assert self.error is not None
-        if isinstance(self.error, InputError):
-            raise self.error
-        raise MssplError(f"frame {self.number}, its neighbour, has failed: {explain(self.error)[0]}") from self.error
-
-    @property
-    def result(self) -> FusedFrame:
-        """``fused``, which is there."""
-        assert self.fused is not None
-        return self.fused
-
     def read_if_small(self) -> RenderPair:
         """Return the renders. Those of a small frame are decoded once, with the passes to fuse, into memory.
 
@@ -167,24 +145,6 @@ class ShotFrame:
             loaded = [render.load([*render.features, "alpha"]) for render in pair]
             self.renders = RenderPair(loaded[0], loaded[-1])
         return self.renders
-
-    def motion_frame(self) -> MotionFrame:
-        """Return what is needed to follow its surfaces."""
-        rgb = None if self.fused is None else self.fused.rgb
-        return MotionFrame(self.hr, rgb, self.vectors, self.renders.hr, self.number, self.lr)
-
-    def keep_result(self) -> None:
-        """Let the fused picture wait for its neighbours, in a temporary file if it is large."""
-        fused = self.result
-        fused.rgb = kept(fused.rgb)
-        fused.alpha = None if fused.alpha is None else kept(fused.alpha)
-        fused.error = None if fused.error is None else kept(fused.error)
-
-    def forget_all_but_picture(self) -> None:
-        """Give up what only this frame's own result needs."""
-        self.means = self.frame_counts = None
-        if self.fused is not None:
-            self.fused = replace(self.fused, clean_aovs={}, error=None, frames=None)
 
 
 def read_frame(files: FrameFiles, settings: Settings, plan: ShotPlan, *, only_frame: bool = False) -> list[ShotFrame]:

@@ -10,14 +10,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
-from oiio_msspl.errors import InputError
+from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -49,8 +49,6 @@ from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key, neighbours
 from oiio_msspl.jobs.write import store_view
 from oiio_msspl.model.contract import ONE_SIZE
-
-F = TypeVar("F", RenderPair, FusedFrame)
 
 
 class ShotRun:
@@ -143,12 +141,12 @@ class ShotRun:
                 self._fuse_others(frame)
             frame.fused = self.fuse(frame)
             if frame.plan.reach.results:
-                frame.keep_result()
+                _keep(frame.fused)
         frame.seconds["fuse"] = time.perf_counter() - start
 
     def _average_renders(self, frame: ShotFrame) -> None:
         """Put the means over neighbours in the place of a frame's renders, and keep what its passes are fused from."""
-        before, after = self._hops(frame, "renders", lambda other: other.as_neighbour(other.is_read).renders)
+        before, after = self._hops(frame, "renders")
         if not (before or after):
             return
         lacking = any(lacking_passes(frame.renders, hop.frame) for hop in (*before, *after))
@@ -245,10 +243,11 @@ class ShotRun:
 
     def _average_results(self, frame: ShotFrame) -> FusedFrame:
         """Average a fused frame with its neighbours. Those that are missing or broken are named in its warnings."""
-        picture = frame.result
+        picture = frame.fused
+        assert picture is not None
         if not self.plan.count:
             return picture
-        before, after = self._hops(frame, "results", lambda other: other.as_neighbour(other.fused is not None).result)
+        before, after = self._hops(frame, "results")
         warnings = list(dict.fromkeys([*picture.warnings, *frame.warnings]))
         if before or after:
             picture = average_results(picture, before, after)
@@ -279,13 +278,21 @@ class ShotRun:
         picture.replaced = picture.passes.pixels
         session.release_layer_memory()
 
-    def _hops(self, frame: ShotFrame, kind: str, content_of: Callable[[ShotFrame], F]) -> list[list[Hop[F]]]:
+    def _hops(self, frame: ShotFrame, kind: str) -> list[list[Hop[Any]]]:
         """Return the hops before and after a frame to the neighbours whose "renders" or "results" are averaged."""
 
-        def frame_of(number: int) -> tuple[MotionFrame, F]:
-            neighbour = self._frames[number, frame.view]
-            content = content_of(neighbour)
-            return neighbour.motion_frame(), content
+        def frame_of(number: int) -> tuple[MotionFrame, Any]:
+            other = self._frames[number, frame.view]
+            content = other.fused if kind == "results" else other.renders if other.is_read else None
+            if content is None:
+                assert other.error is not None
+                if isinstance(other.error, InputError):
+                    raise other.error  # its files can't be used, so it is left out in every run
+                # Without it, the frame would have other pixels than in another run.
+                reason = explain(other.error)[0]
+                raise MssplError(f"frame {number}, its neighbour, has failed: {reason}") from other.error
+            picture = None if other.fused is None else other.fused.rgb
+            return MotionFrame(other.hr, picture, other.vectors, other.renders.hr, number, other.lr), content
 
         motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, kind)
         return [find_hops(motion, frame.number, side, frame_of, frame.warnings) for side in sides]
@@ -302,7 +309,9 @@ class ShotRun:
             if key not in pictures:
                 frame.fused = None
             if not self._timeline.waits(frame.number):
-                frame.forget_all_but_picture()
+                frame.means = frame.frame_counts = None
+                if frame.fused is not None:
+                    frame.fused = replace(frame.fused, clean_aovs={}, error=None, frames=None)
         for view, motion in self._motion.items():
             motion.keep({number for number, own in self._frames if own == view})
 
@@ -312,6 +321,13 @@ def _share_by_spp(lr: MappedRender, hr: MappedRender) -> float | None:
     if lr.spp is None or hr.spp is None or align(lr, hr).scale != ONE_SIZE:
         return None
     return lr.spp / (lr.spp + hr.spp)
+
+
+def _keep(fused: FusedFrame) -> None:
+    """Let a fused picture wait for its neighbours, in temporary files if it is large."""
+    fused.rgb = kept(fused.rgb)
+    fused.alpha = None if fused.alpha is None else kept(fused.alpha)
+    fused.error = None if fused.error is None else kept(fused.error)
 
 
 def _for_passes(render: Render, *, on_disk: bool) -> Render:

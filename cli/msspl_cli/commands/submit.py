@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import shlex
 from collections.abc import Callable
@@ -52,13 +51,9 @@ def _with_options_of_fuse(command: Callable[..., None]) -> Callable[..., None]:
         if parameter.kind != parameter.VAR_KEYWORD
     ]
 
-    @functools.wraps(command)
-    def with_options(**values: Any) -> None:
-        command(**values)
-
-    with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return with_options
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
 
 
 @_with_options_of_fuse

@@ -147,13 +147,53 @@ def make_job(
     folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
     if not folder.is_dir():
         raise InputError(f"{output}: the folder {folder} does not exist; create it first")
-    job = _describe(shot, renders, output, options, files, chunk, timeout)
-    job.template["name"] = _literal(name or _name_of(shot))[:_LONGEST_NAME]
-    _run_by(job, command, packages)
+    job = Job(shot, {"parameterDefinitions": []}, {})
+    arguments = [
+        _add_sequence(job, name, path, path.is_dir(), what, "IN")
+        for (name, what), path in zip(_RENDERS[-len(renders) :], renders, strict=True)
+    ]
+    arguments += ["--output", _add_sequence(job, "Out", output, shot.named_as_hr, "Fused frames", "OUT")]
+    # Open Job Description writes ranges in rising order, and their step with a colon.
+    numbers = format_frames(sorted(frame.number for frame in shot.frames))
+    said = "Frames of the shot: 1001-1100 or 1001-1099:2,1200"
+    frame_range = _add(job, "Frames", numbers.replace("x", ":"), said, "LINE_EDIT", "Frames", type="STRING")
+    # The time limit of a task is written for so many frames.
+    limits = {"type": "INT", "minValue": 1, "maxValue": chunk}
+    size = _add(job, "FramesPerTask", chunk, "Frames per task", "SPIN_BOX", "Frames per task", **limits)
+    for option, path in files.items():
+        label = option.removeprefix("--")
+        title, said, choose = label.title().replace("-", ""), f"{option} of msspl-fuse", _path("FILE", "IN")
+        arguments += [option, _add(job, title, str(path.absolute()), said, "CHOOSE_INPUT_FILE", label, **choose)]
+    arguments += ["--frames", "{{Task.Param.Frame}}", "--update", "--progress", "openjd", *map(_literal, options)]
+    for manager, wanted in packages.items():
+        if manager not in PACKAGES:
+            raise InputError(f"packages of {manager!r}: use one of {', '.join(PACKAGES)}")
+        said = "Packages that the environment of the queue installs"
+        _add(job, PACKAGES[manager], wanted, said, "LINE_EDIT", f"{manager.title()} packages", type="STRING")
+    program, *first_arguments = _words_of(command)
+    action = {
+        "command": program,
+        "args": [*first_arguments, *arguments],
+        "timeout": chunk * timeout,
+        "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": GRACE},
+    }
+    chunks = {"defaultTaskCount": size, "rangeConstraint": "NONCONTIGUOUS"}
+    task_frames = {"name": "Frame", "type": "CHUNK[INT]", "range": frame_range, "chunks": chunks}
     amounts = [{"name": "amount.worker.memory", "min": -(-memory // 2**20)}]  # MiB, as much as a task may take
     if device in GPUS:
         amounts.append({"name": "amount.worker.gpu", "min": 1})
-    job.template["steps"][0]["hostRequirements"] = {"amounts": amounts}
+    step = {
+        "name": "Fuse",
+        "parameterSpace": {"taskParameterDefinitions": [task_frames]},
+        "hostRequirements": {"amounts": amounts},
+        "script": {"actions": {"onRun": action}},
+    }
+    job.template.update(
+        specificationVersion="jobtemplate-2023-09",
+        extensions=["TASK_CHUNKING"],
+        name=_literal(name or _name_of(shot))[:_LONGEST_NAME],
+        steps=[step],
+    )
     return job
 
 
@@ -166,102 +206,40 @@ def _name_of(shot: Shot) -> str:
     return f"msspl-fuse {'/'.join([*folders, base] if '{{' not in base else folders)} {frames}"
 
 
-def _run_by(job: Job, command: str, packages: Mapping[str, str]) -> None:
-    """Let a job run its program by a launcher, and in an environment with packages."""
+def _words_of(command: str) -> list[str]:
+    """Return the program and the arguments of a command, as a shell takes it apart."""
     try:
         words = [_literal(word) for word in shlex.split(command)]
     except ValueError as error:
         raise InputError(f"--command {command!r}: can't be read ({error}); quote it as for a shell") from error
     if not words:
         raise InputError("--command: is empty; name msspl-fuse, or what starts it")
-    action = job.template["steps"][0]["script"]["actions"]["onRun"]
-    action["command"], action["args"] = words[0], [*words[1:], *action["args"]]
-    for manager, wanted in packages.items():
-        if manager not in PACKAGES:
-            raise InputError(f"packages of {manager!r}: use one of {', '.join(PACKAGES)}")
-        control = {"control": "LINE_EDIT", "label": f"{manager.title()} packages", "groupLabel": "Software"}
-        description = "Packages that the environment of the queue installs"
-        job.template["parameterDefinitions"].append(
-            {"name": PACKAGES[manager], "description": description, "type": "STRING", "userInterface": control}
-        )
-        job.values[PACKAGES[manager]] = wanted
+    return words
 
 
-def _describe(
-    shot: Shot,
-    renders: Sequence[Path],
-    output: Path,
-    options: Sequence[str],
-    files: dict[str, Path],
-    chunk: int,
-    timeout: int,
-) -> Job:
-    """Write the job of a shot that was checked. ``files`` are options of ``msspl-fuse`` that name a file."""
-    parameters: list[dict[str, Any]] = []
-    values: dict[str, Any] = {}
+def _add(job: Job, name: str, value: str | int, description: str, control: str, label: str, **definition: Any) -> str:
+    """Define a job parameter with its widget and label, and return the text that stands for its value."""
+    if len(str(value)) > _LONGEST:
+        raise InputError(f"{name} has more than the {_LONGEST} characters that a job parameter may have: {value}")
+    group = "Software" if name in ("Model", *PACKAGES.values()) else "Shot"
+    widget = {"control": control, "label": label, "groupLabel": group}
+    parameter = {"name": name, "description": description, **definition, "userInterface": widget}
+    job.template["parameterDefinitions"].append(parameter)
+    job.values[name] = value
+    return f"{{{{Param.{name}}}}}"
 
-    def add(name: str, value: str | int, description: str, control: str, label: str, **definition: Any) -> str:
-        """Define a job parameter with its widget and label, and return the text that stands for its value."""
-        if len(str(value)) > _LONGEST:
-            raise InputError(f"{name} has more than the {_LONGEST} characters that a job parameter may have: {value}")
-        widget = {"control": control, "label": label, "groupLabel": "Software" if name == "Model" else "Shot"}
-        parameters.append({"name": name, "description": description, **definition, "userInterface": widget})
-        values[name] = value
-        return f"{{{{Param.{name}}}}}"
 
-    def add_sequence(name: str, path: Path, is_folder: bool, what: str, flow: str) -> str:
-        """Define two parameters, folder and pattern: a farm can copy a folder, but not a pattern."""
-        folder, file = (path, "") if is_folder else (path.parent, path.name)
-        choose = {"type": "PATH", "objectType": "DIRECTORY", "dataFlow": flow}
-        place = str(folder.absolute())
-        directory = add(f"{name}Folder", place, what, "CHOOSE_DIRECTORY", f"{what}: folder", **choose)
-        said = "Pattern in the folder; empty for all of it"
-        pattern = add(f"{name}Name", file, said, "LINE_EDIT", f"{what}: files", type="STRING")
-        return f"{directory}/{pattern}"
+def _add_sequence(job: Job, name: str, path: Path, is_folder: bool, what: str, flow: str) -> str:
+    """Define two parameters, folder and pattern: a farm can copy a folder, but not a pattern."""
+    folder, file = (path, "") if is_folder else (path.parent, path.name)
+    place, choose = str(folder.absolute()), _path("DIRECTORY", flow)
+    directory = _add(job, f"{name}Folder", place, what, "CHOOSE_DIRECTORY", f"{what}: folder", **choose)
+    said = "Pattern in the folder; empty for all of it"
+    return f"{directory}/{_add(job, f'{name}Name', file, said, 'LINE_EDIT', f'{what}: files', type='STRING')}"
 
-    arguments = [
-        *(
-            add_sequence(name, path, path.is_dir(), what, "IN")
-            for (name, what), path in zip(_RENDERS[-len(renders) :], renders, strict=True)
-        ),
-        "--output",
-        add_sequence("Out", output, shot.output.folder == output, "Fused frames", "OUT"),
-    ]
-    # Open Job Description writes ranges in rising order, and their step with a colon.
-    numbers = format_frames(sorted(frame.number for frame in shot.frames)).replace("x", ":")
-    said = "Frames of the shot: 1001-1100 or 1001-1099:2,1200"
-    frame_range = add("Frames", numbers, said, "LINE_EDIT", "Frames", type="STRING")
-    # The time limit of a task is written for so many frames.
-    limits = {"type": "INT", "minValue": 1, "maxValue": chunk}
-    size = add("FramesPerTask", chunk, "Frames per task", "SPIN_BOX", "Frames per task", **limits)
-    for option, path in files.items():
-        name = option.removeprefix("--").title().replace("-", "")
-        said, choose = f"{option} of msspl-fuse", {"type": "PATH", "objectType": "FILE", "dataFlow": "IN"}
-        file = add(name, str(path.absolute()), said, "CHOOSE_INPUT_FILE", option.removeprefix("--"), **choose)
-        arguments += [option, file]
-    arguments += ["--frames", "{{Task.Param.Frame}}", "--update", "--progress", "openjd"]
-    arguments += map(_literal, options)
-    chunks = {"defaultTaskCount": size, "rangeConstraint": "NONCONTIGUOUS"}
-    task_frames = {"name": "Frame", "type": "CHUNK[INT]", "range": frame_range, "chunks": chunks}
-    command = {
-        "command": "msspl-fuse",
-        "args": arguments,
-        "timeout": chunk * timeout,
-        "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": GRACE},
-    }
-    step = {
-        "name": "Fuse",
-        "parameterSpace": {"taskParameterDefinitions": [task_frames]},
-        "script": {"actions": {"onRun": command}},
-    }
-    template = {
-        "specificationVersion": "jobtemplate-2023-09",
-        "extensions": ["TASK_CHUNKING"],
-        "name": "msspl-fuse",
-        "parameterDefinitions": parameters,
-        "steps": [step],
-    }
-    return Job(shot, template, values)
+
+def _path(kind: str, flow: str) -> dict[str, str]:
+    return {"type": "PATH", "objectType": kind, "dataFlow": flow}
 
 
 def write_bundle(folder: Path, job: Job) -> None:

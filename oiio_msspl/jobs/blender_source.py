@@ -87,10 +87,9 @@ class RenderedShot:
         keep: bool = False,
     ) -> None:
         settings = replace(settings, model=family_of(settings.model) or settings.model)
-        contract = settings.load(scale).contract
+        contract = settings.session(scale).contract
         if contract.scale != scale:
             raise InputError(f"--model {settings.model}: is for x{contract.scale}, but --scale is {scale}")
-        settings.session(scale)  # refuses a model that does not make the layers that are asked for
         self._settings, self._scale, self._shot, self._wanted, self._keep = settings, scale, shot, list(wanted), keep
         #: What the names of a frame's renders end with if they are kept.
         self.suffixes = suffixes(renders, scale)
@@ -150,7 +149,7 @@ class RenderedShot:
         held = result_bytes(alignment, error=write.error_layer)
         held += sum(memory_to_average(self._plan.views[None].reach, window, USUAL_CHANNELS, scale))
         written = pixel_bytes * width * height if write.layout == "multilayer" else 0
-        most, session = self._settings.max_memory, self._settings.load(scale)
+        most, session = self._settings.max_memory, self._settings.session(scale)
         check_frame_memory(alignment, session, write, most, written, held)
         if layers is None or write.passes in ((), ("none",)):
             return

@@ -109,6 +109,6 @@ def fuse_files(
     frame.report.seconds |= {"read": opened - start, "fuse": time.perf_counter() - opened}
     with limit_threads(threads):
         write_settled(frame, run.existing, only_frame=True)
-    if frame.progress is not None:
-        frame.progress.end()
+    if progress is not None:
+        progress(WHOLE, WHOLE)
     return frame.report

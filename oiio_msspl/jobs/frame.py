@@ -211,8 +211,8 @@ def _budget(frames: Sequence[ShotFrame], settings: Settings, *, missing: int) ->
     for frame in frames:
         low, high = frame.stored
         try:  # a file may have many more features than the model reads, and decoding them all is slow
-            features = features_read(settings.load(align(low, high).scale))
-        except InputError:  # the model can't be loaded, which ends the job when it is needed
+            features = features_read(settings.session(align(low, high).scale))
+        except InputError:  # the model can't be used, which ends the job when it is needed
             features = [*HRLS_FEATURES, "alpha"]
         features += light_features(high)
         most, error = settings.max_memory, frame.write.error_layer

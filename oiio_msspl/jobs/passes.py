@@ -96,10 +96,6 @@ class Progress:
         if done == count:
             self._part += 1
 
-    def end(self) -> None:
-        """Tell that everything is done."""
-        self._tell(WHOLE, WHOLE)
-
 
 def costs_of(views: Sequence[MappedRender], session: Session, write: WriteOptions) -> list[float]:
     """Return what the parts of a frame's work cost: tiles and passes of each view, and then writing."""

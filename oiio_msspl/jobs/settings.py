@@ -62,24 +62,16 @@ class Settings:
     sessions: dict[tuple[int, str | None], Session] = field(default_factory=dict)
     """Models that are loaded, by scale and ``model``."""
 
-    def load(self, scale: int) -> Session:
+    def session(self, scale: int) -> Session:
         """Return the model for a scale. Each model is loaded once.
 
         Raises:
-            InputError: there is no such model, or the device can't be used.
+            InputError: there is no such model, the device can't be used, or the model does not make a layer that is
+                asked for.
         """
         session = self.sessions.get((scale, self.model))
         if session is None:
             session = self.sessions[scale, self.model] = load_model(scale, self.model, self.device, self.threads)
-        return session
-
-    def session(self, scale: int) -> Session:
-        """Return the model for a scale, and check that it makes the layers that are asked for.
-
-        Raises:
-            InputError: there is no such model, or it does not make such a layer.
-        """
-        session = self.load(scale)
         if self.write.error_layer:
             session.require_error()
         if self.write.data_passes:

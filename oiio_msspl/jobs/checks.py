@@ -12,7 +12,7 @@ from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.renderers import file_names
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_folder, check_separate
+from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.fusion.fuse import check_model
@@ -30,21 +30,7 @@ from oiio_msspl.model.contract import Contract
 log = logging.getLogger(__name__)
 
 
-def check_output(shot: Shot, inputs: InputOptions, model: str | None, more_targets: Iterable[Path]) -> None:
-    """Check that the frames and ``more_targets`` can be written. The output folder may be missing.
-
-    Raises:
-        InputError: the folder can't be written to, a result would replace an input, or a mapping names one file of a
-            sequence.
-    """
-    folder = shot.output.folder
-    _check_mapped_sequences(shot.frames, inputs)
-    check_no_file(folder)
-    check_folder(shot.output.path(0) if folder.exists() else folder)
-    check_no_input(shot, inputs, model, more_targets)
-
-
-def _check_mapped_sequences(frames: Sequence[FrameFiles], inputs: InputOptions) -> None:
+def check_mapped_sequences(frames: Sequence[FrameFiles], inputs: InputOptions) -> None:
     """Raise InputError if a mapping names one file of a sequence for all frames of a shot."""
     numbers = {frame.number for frame in frames}
     for name in file_names(inputs.mapping):
@@ -166,7 +152,7 @@ def check_wanted_outputs(
             can't hold the layers, the model is for another scale or does not make a layer, or ``max_memory`` bytes are
             too few.
     """
-    _check_mapped_sequences(frames, inputs)
+    check_mapped_sequences(frames, inputs)
     problem: InputError | None = None
     for frame in frames:
         if frame.lr is None or frame.hr is None:

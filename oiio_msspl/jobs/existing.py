@@ -12,12 +12,13 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target
 from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.findings import Finding
 from oiio_msspl.jobs.inputs import files_by_name
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.report import WEIGHTS_ATTRIBUTE
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import Settings
-from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, older_than, result_of
+from oiio_msspl.jobs.shot_report import FAILED, MISSING, OLDER, SKIPPED, FrameResult, result_of
 from oiio_msspl.jobs.timeline import neighbours
 from oiio_msspl.model.catalogue import model_files
 from oiio_msspl.model.contract import ONE_SIZE, SCALES
@@ -62,17 +63,18 @@ class ExistingResults:
 
     def dated_in_future(self, frames: Sequence[FrameFiles]) -> Path | None:
         """Return a file whose date lies in the future, so that ``update`` can't tell what is newer; None without."""
+        if not self.settings.update:
+            return None
         latest = time.time() + CLOCK_SKEW
-        paths = (
-            path for files in frames for path in (files.lr, files.hr, files.output) if self.settings.update and path
-        )
-        return next((path for path in paths if path.is_file() and path.stat().st_mtime > latest), None)
+        paths = (path for files in frames for path in (files.lr, files.hr, files.output) if path and path.is_file())
+        return next((path for path in paths if path.stat().st_mtime > latest), None)
 
     def known_result(self, files: FrameFiles, shot: Shot) -> FrameResult | None:
         """Return the result of a frame that need not or can't be fused; None for a frame to fuse."""
         if self.skips(files):
             newer = self.newer_inputs(files)
-            return result_of(files, SKIPPED, warnings=[older_than(newer[0])] if newer else [])
+            text = f"is older than {newer[0]}; --update fuses such frames again" if newer else ""
+            return result_of(files, SKIPPED, warnings=[Finding(OLDER, text)] if newer else [])
         sources = [("LRHS", files.lr, shot.lr), ("HRLS", files.hr, shot.hr)]
         if shot.has_one_render:
             sources = [("render", files.hr, shot.hr)]

@@ -191,11 +191,13 @@ def _not_written(sequences: list[Sequence], output: Path) -> list[Sequence]:
     # Names are compared, because a pattern may have fewer digits than its numbers: name.#.exr means name.1001.exr, too.
     written = {path.name for path in _files_of(parse_pattern(output)).values()}
 
-    def is_result(sequence: Sequence) -> bool:
-        in_folder = sequence.pattern.folder.samefile(output.parent)
-        return in_folder and written.issuperset(path.name for path in sequence.files.values())
-
-    return [sequence for sequence in sequences if not is_result(sequence)] or sequences
+    renders = [
+        sequence
+        for sequence in sequences
+        if not sequence.pattern.folder.samefile(output.parent)
+        or not written.issuperset(path.name for path in sequence.files.values())
+    ]
+    return renders or sequences
 
 
 def format_frames(numbers: Iterable[int]) -> str:

@@ -20,7 +20,14 @@ from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.checks import check_first_pair, check_output, look_ahead, model_of_shot
+from oiio_msspl.jobs.checks import (
+    check_first_pair,
+    check_mapped_sequences,
+    check_no_file,
+    check_no_input,
+    look_ahead,
+    model_of_shot,
+)
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.farm.dask import fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
@@ -114,14 +121,18 @@ def fuse_shot(
     if client is None:  # workers of a cluster may have other devices
         require_device(device)
     path = None if report_path is None else Path(report_path)
-    check_output(shot, inputs, model, [] if path is None else [path])
+    check_mapped_sequences(shot.frames, inputs)
+    folder = shot.output.folder
+    check_no_file(folder)
+    check_folder(shot.output.path(0) if folder.exists() else folder)
+    check_no_input(shot, inputs, model, [] if path is None else [path])
     with limit_threads(threads):
         plan = plan_temporal(shot, inputs, temporal, model, write)
     skip, memory = skip_existing or update, bytes_of(max_memory)
     settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update, strict)
     report = ShotReport(shot, temporal=plan.text, neighbours=plan.count, warnings=plan.warnings)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
-    make_folder(shot.output.folder)
+    make_folder(folder)
     check_folder(shot.output.path(0))
     running = _RunningReport(report, path, progress, start)
     existing = ExistingResults(settings, plan)

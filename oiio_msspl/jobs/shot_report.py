@@ -37,7 +37,7 @@ MOST_NAMES = 6
 #: Bytes of the largest file that is read as an earlier report. A frame takes one or two thousand.
 LARGEST_REPORT = 128 << 20
 
-#: The code of the warning of :func:`older_than`.
+#: The code of the warning that a result is older than a file that it is made from.
 OLDER = "older"
 
 FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
@@ -266,8 +266,8 @@ def read_earlier(
         overwrite, skip_existing: whether the file may exist.
 
     Returns:
-        What the earlier report says of each frame, without the warning of :func:`older_than`, which each run finds out
-        anew.
+        What the earlier report says of each frame, without the warnings that it is older than an input, which each run
+        finds out anew.
 
     Raises:
         InputError: the file exists and may not be replaced, or it is not a report of this shot. Not even with
@@ -303,8 +303,3 @@ def read_earlier(
     if isinstance(output, str) and os.path.realpath(output) != os.path.realpath(str(report.shot.output)):
         raise InputError(f"{path}: is the report of another shot, whose frames are {output}; name another file")
     return entries
-
-
-def older_than(path: Path) -> Finding:
-    """Return the warning that a result is older than a file that it is made from."""
-    return Finding(OLDER, f"is older than {path}; --update fuses such frames again")

@@ -25,7 +25,6 @@ from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
-from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ def fuse_frames(
         A frame as soon as it ends, in any order, with its outcome: None if its EXR already existed.
 
     Raises:
-        InputError: there is no such model, or a worker takes several frames at a time.
+        InputError: a worker takes several frames at a time.
         MssplError: the scheduler is gone.
     """
     from dask.distributed import CancelledError, KilledWorker, as_completed
@@ -90,7 +89,6 @@ def fuse_frames(
     workers = _most_workers_on_a_machine(client)
     if settings.model is not None and Path(settings.model).is_file():
         settings = replace(settings, model=str(Path(settings.model).absolute()))
-    find_model(2, settings.model)  # refuses an unknown model before any task is submitted
     address = client.scheduler.address
     run = uuid.uuid4().hex
     #: The chunks under way, and how often a frame of a chunk may still be tried again.

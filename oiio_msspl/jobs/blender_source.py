@@ -96,14 +96,15 @@ class RenderedShot:
         self._required = options.frames != AUTO
         self._at_work = 0  # number of the frame that an error is about
         self._renders: dict[int, FrameFiles] = {}  # on the disk, by frame number
-        self._warnings: dict[Path, list[Finding]] = {}  # about the frames that are written
+        #: The results that are written, each with its warnings.
+        self.written: dict[Path, list[Finding]] = {}
         frames = {files.number: files for files in shot}
         # Every neighbour must be rendered, so `best` takes no more of them than other models.
         count = options.count()
         length = f"{count} frame{'s' if count > 1 else ''}"
         text = f"with {length} before and after each, along the motion vectors of Cycles" if count else ""
-        # How Cycles stores vectors is read from the first frame.
-        self._plan = ShotPlan(frames, {None: ViewPlan(reach_of(count, VECTORS))}, text)
+        #: How frames are averaged. How Cycles stores vectors is read from the first frame.
+        self.plan = ShotPlan(frames, {None: ViewPlan(reach_of(count, VECTORS))}, text)
         if count and not any(number + 1 in frames for number in frames):
             self.fuse_alone("no two frames follow each other")
         self._run: ShotRun | None = None
@@ -113,23 +114,13 @@ class RenderedShot:
     def order(self) -> list[FrameFiles]:
         """The frames to render: those that are to be written, and their neighbours."""
         shot = {files.number: files for files in self._shot}
-        return [shot[number] for number in self._plan.timeline(self._wanted).order]
-
-    @property
-    def averages(self) -> bool:
-        """True if frames are averaged with their neighbours."""
-        return self._plan.count > 0
-
-    @property
-    def text(self) -> str:
-        """How the shot is fused over time, in words; empty if the user has switched that off."""
-        return self._plan.text
+        return [shot[number] for number in self.plan.timeline(self._wanted).order]
 
     def fuse_alone(self, reason: str) -> None:
         """Fuse every frame by itself, before any is fused. Raise InputError if the user has asked for neighbours."""
         if self._required:
-            raise InputError(f"--temporal {self._plan.count}: {reason}")
-        self._plan = ShotPlan(text=f"frame by frame: {reason}")
+            raise InputError(f"--temporal {self.plan.count}: {reason}")
+        self.plan = ShotPlan(text=f"frame by frame: {reason}")
 
     def check(self, size: tuple[int, int], layers: Sequence[str] | None, pixel_bytes: int) -> None:
         """Refuse a frame that could not be fused, before it is rendered.
@@ -147,7 +138,7 @@ class RenderedShot:
         window, grid = Window(0, 0, width, height), Window(0, 0, -(-width // scale), -(-height // scale))
         alignment = Alignment(scale, grid, grid, window)
         held = result_bytes(alignment, error=write.error_layer)
-        held += sum(memory_to_average(self._plan.views[None].reach, window, USUAL_CHANNELS, scale))
+        held += sum(memory_to_average(self.plan.views[None].reach, window, USUAL_CHANNELS, scale))
         written = pixel_bytes * width * height if write.layout == "multilayer" else 0
         most, session = self._settings.max_memory, self._settings.session(scale)
         check_frame_memory(alignment, session, write, most, written, held)
@@ -193,7 +184,7 @@ class RenderedShot:
                 first, last = (str(beside(frame.files.output, self.suffixes[index])) for index in (0, -1))
                 frame.report.sources = (first, last) if self._keep else ("a render that was not kept",) * 2
                 write_settled(frame, run.existing)
-                self._warnings[frame.files.output] = frame.report.warnings
+                self.written[frame.files.output] = frame.report.warnings
         self._discard()
 
     @contextmanager
@@ -210,7 +201,7 @@ class RenderedShot:
             raise (InputError if code == InputError.exit_code else MssplError)(said) from error
 
     def _start(self, files: FrameFiles) -> ShotRun:
-        plan = self._plan
+        plan = self.plan
         if plan.count:
             _, hr = map_pair(*files.pair, self._settings.inputs)
             # The format need not be verified: Blender is known, and motion blur is off.
@@ -249,20 +240,16 @@ class RenderedShot:
 
     def waits(self, output: Path) -> bool:
         """Return whether a frame is rendered, and waits for its neighbours."""
-        return output not in self._warnings and any(frame.output == output for frame in self._renders.values())
-
-    def warnings(self, output: Path) -> list[Finding]:
-        """Return the warnings about a frame that is written."""
-        return self._warnings.get(output, [])
+        return output not in self.written and any(frame.output == output for frame in self._renders.values())
 
     def _discard(self) -> None:
         """Delete the renders that no frame needs any more, or keep them beside the result."""
-        missing = [files.number for files in self._wanted if files.output not in self._warnings]
-        needed = {n for number in missing for n in (number, *neighbours(number, self._plan.count, self._plan.frames))}
+        missing = [files.number for files in self._wanted if files.output not in self.written]
+        needed = {n for number in missing for n in (number, *neighbours(number, self.plan.count, self.plan.frames))}
         for number in self._renders.keys() - needed:
             files = self._renders.pop(number)
             for path, target in self._places(files).items():
-                if self._keep and files.output in self._warnings:
+                if self._keep and files.output in self.written:
                     os.replace(path, target)
                 else:
                     path.unlink()

@@ -161,7 +161,7 @@ def render(
             "filter": pixel_filter.upper(),
             "view_layer": view_layer,
             "components": components,
-            "vectors": fused.averages,
+            "vectors": fused.plan.count > 0,
             "threads": threads,
         },
         "overwrite": overwrite,
@@ -276,8 +276,8 @@ class _Printer:
 
         while self._waiting and not self._shot.waits(result := Path(self._waiting[0]["output"])):
             report = self._waiting.pop(0)
-            report["temporal"] = self._shot.text
-            report["warnings"] += [*self._warnings, *self._shot.warnings(result)]
+            report["temporal"] = self._shot.plan.text
+            report["warnings"] += [*self._warnings, *self._shot.written.get(result, [])]
             report["warning_codes"] = codes_of(report["warnings"])
             for render, suffix in zip(report["renders"], self._shot.suffixes, strict=True):
                 render["file"] = str(beside(result, suffix)) if self._keep else None
@@ -293,9 +293,10 @@ class _Printer:
         if as_json:
             print(json.dumps(self._reports, indent=2))
         elif self._reports and not self._quiet:
-            _print_times(self._reports, alone=not self._shot.averages)
-            if self._shot.text:
-                print(f"Fused {self._shot.text}")
+            plan = self._shot.plan
+            _print_times(self._reports, alone=not plan.count)
+            if plan.text:
+                print(f"Fused {plan.text}")
 
 
 def _print_times(reports: Sequence[dict[str, Any]], *, alone: bool) -> None:

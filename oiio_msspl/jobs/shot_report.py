@@ -196,14 +196,14 @@ def fused_result(frame: FrameFiles, frame_report: dict[str, Any], report: ShotRe
     if counted is not None and counted < ALONE:
         text = "its neighbours hardly count: their light or their surfaces differ from those of this frame"
         warnings.append(Finding("neighbours_differ", text))
-    for changed in (_changed_settings, _changed_layers, _changed_views, _changed_sets):
+    for changed in (_changed_settings, _changed_layers, _changed_sets):
         texts = [f"{text} in frame {first['frame']}: it may flicker" for text in changed(here, first)]
         warnings += [Finding("flicker", text) for text in texts]
     return result_of(frame, FUSED, warnings=warnings, **{name: frame_report[name] for name in _OF_FRAME})
 
 
 def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """Compare all but layers: "WHAT is X here and Y" for each difference between the reports of two fused frames."""
+    """Compare all but layers and passes: "WHAT is X here and Y" for each difference between two reports."""
     words = {"default": "not found", "absent": "not found"}
     before, now = (
         {row["feature"]: words.get(row["status"], row["status"]) for row in report["aovs"] if row["status"] != "unused"}
@@ -218,6 +218,12 @@ def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
         pairs["the digest of its weights"] = as_text(here["weights"]), as_text(first["weights"])
     pairs["the version"] = here["version"], first["version"]
     pairs["--temporal"] = str(here["neighbours"] or "off"), str(first["neighbours"] or "off")
+    # The report on a file with only one view has an empty list.
+    entries = [report.get("fused_views") or [report] for report in (here, first)]
+    now_fused, before_fused = ([name_of(entry["view"] or "") for entry in views] for views in entries)
+    if max(len(now_fused), len(before_fused)) > 1:
+        pairs |= {view: ("not fused", "fused") for view in before_fused if view not in now_fused}
+        pairs |= {view: ("fused", "not fused") for view in now_fused if view not in before_fused}
     return [f"{what} is {state} here and {earlier}" for what, (state, earlier) in pairs.items() if state != earlier]
 
 
@@ -231,16 +237,6 @@ def _changed_layers(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
             listed = ", ".join(names[:MOST_NAMES]) + (", ..." if len(names) > MOST_NAMES else "")
             texts.append(f"the layer{'s' * (len(names) > 1)} {listed} {'are' if len(names) > 1 else 'is'} {states}")
     return texts
-
-
-def _changed_views(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    # The report on a file with only one view has an empty list.
-    entries = [report.get("fused_views") or [report] for report in (here, first)]
-    now, before = ([name_of(entry["view"] or "") for entry in views] for views in entries)
-    if max(len(now), len(before)) == 1:
-        return []
-    lacking = [f"{view} is not fused here and fused" for view in before if view not in now]
-    return lacking + [f"{view} is fused here and not fused" for view in now if view not in before]
 
 
 def _changed_sets(here: dict[str, Any], first: dict[str, Any]) -> list[str]:

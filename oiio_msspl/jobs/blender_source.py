@@ -90,7 +90,7 @@ class RenderedShot:
         contract = settings.session(scale).contract
         if contract.scale != scale:
             raise InputError(f"--model {settings.model}: is for x{contract.scale}, but --scale is {scale}")
-        self._settings, self._scale, self._shot, self._wanted, self._keep = settings, scale, shot, list(wanted), keep
+        self._settings, self._scale, self._wanted, self._keep = settings, scale, list(wanted), keep
         #: What the names of a frame's renders end with if they are kept.
         self.suffixes = suffixes(renders, scale)
         self._required = options.frames != AUTO
@@ -113,14 +113,13 @@ class RenderedShot:
     @property
     def order(self) -> list[FrameFiles]:
         """The frames to render: those that are to be written, and their neighbours."""
-        shot = {files.number: files for files in self._shot}
-        return [shot[number] for number in self.plan.timeline(self._wanted).order]
+        return [self.plan.frames[number] for number in self.plan.timeline(self._wanted).order]
 
     def fuse_alone(self, reason: str) -> None:
         """Fuse every frame by itself, before any is fused. Raise InputError if the user has asked for neighbours."""
         if self._required:
             raise InputError(f"--temporal {self.plan.count}: {reason}")
-        self.plan = ShotPlan(text=f"frame by frame: {reason}")
+        self.plan = ShotPlan(self.plan.frames, text=f"frame by frame: {reason}")
 
     def check(self, size: tuple[int, int], layers: Sequence[str] | None, pixel_bytes: int) -> None:
         """Refuse a frame that could not be fused, before it is rendered.
@@ -174,7 +173,7 @@ class RenderedShot:
                 if told:
                     run.settings = replace(run.settings, model=family)
         if is_first:
-            run.existing.check_weights(frame for frame in self._shot if frame not in self._wanted)
+            run.existing.check_weights(frame for frame in run.plan.frames.values() if frame not in self._wanted)
         with self._keep_if_it_fails(files):
             views = run.read(files)
             views[0].require()
@@ -196,7 +195,7 @@ class RenderedShot:
         except Exception as error:
             said, code = explain(error)
             said = self._keep_failed(self._renders.get(self._at_work, files), said)
-            if len(self._shot) > 1:
+            if len(self.plan.frames) > 1:
                 said = f"frame {self._at_work}: {said}"
             raise (InputError if code == InputError.exit_code else MssplError)(said) from error
 

@@ -21,7 +21,6 @@ from oiio_msspl.jobs.fitting import check_files
 from oiio_msspl.jobs.inputs import InputOptions, find_views, map_pair
 from oiio_msspl.jobs.memory import check_frame_memory
 from oiio_msspl.jobs.passes import check_layers, sets_to_fuse
-from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
 from oiio_msspl.jobs.sequence import FrameFiles, Shot, frame_in_name
 from oiio_msspl.jobs.settings import Settings, choose_model
 from oiio_msspl.model.catalogue import family_of, find_model, for_spread_noise
@@ -173,17 +172,3 @@ def check_wanted_outputs(
         return
     if problem is not None:
         raise problem
-
-
-def check_temporal(
-    shot: Shot, inputs: InputOptions, options: TemporalOptions, model: str | None, write: WriteOptions
-) -> None:
-    """Check that the shot can be averaged over time as the user asks, before a farm is asked for it.
-
-    If files of the mapping are missing, nothing is checked: they may exist on the workers only.
-
-    Raises:
-        InputError: see :func:`oiio_msspl.jobs.plan.plan_temporal`.
-    """
-    if all(path.exists() for hr in shot.hr.files.values() for path in inputs.files(hr, None)):
-        plan_temporal(shot, inputs, options, model, write)

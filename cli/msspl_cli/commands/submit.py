@@ -87,9 +87,9 @@ def submit(
     """
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl.image.parallel import limit_threads
-    from oiio_msspl.jobs.checks import check_first_pair, check_temporal, check_wanted_outputs
+    from oiio_msspl.jobs.checks import check_first_pair, check_wanted_outputs
     from oiio_msspl.jobs.farm.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
-    from oiio_msspl.jobs.plan import TemporalOptions
+    from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
     from oiio_msspl.jobs.sequence import format_frames
     from oiio_msspl.jobs.settings import bytes_of
 
@@ -117,8 +117,10 @@ def submit(
         **{name: given[name] for name in ("frames", "map_file", "device", "view", "max_memory")},
     )
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
-    with limit_threads(given["threads"]):
-        check_temporal(job.shot, inputs, temporal, model, write)
+    # Files of the mapping may exist on the workers only. Without them, the motion can't be looked at.
+    if all(path.exists() for hr in job.shot.hr.files.values() for path in inputs.files(hr, None)):
+        with limit_threads(given["threads"]):
+            plan_temporal(job.shot, inputs, temporal, model, write)
     doubts = check_first_pair(job.shot.frames, inputs)
     write_bundle(bundle, job)
     for doubt in doubts:

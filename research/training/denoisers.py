@@ -23,15 +23,13 @@ from research.training.render_mean import with_mean
 
 #: Height and width of the mean are multiples of this.
 ALIGNMENT = 16
-#: The extra input channel is the noise.
-EXTRA = 1
 #: The convolutions of the large network's two lowest levels.
 LOWEST = ("enc_conv4a", "enc_conv4b", "enc_conv5a", "enc_conv5b", "dec_conv4a", "dec_conv4b")
-#: By the size of :class:`research.training.joint.JointFusion`. Of the large network, only the outer levels are
-#: trained: the two lowest ones have two thirds of all weights.
-STARTS = {
-    "small": oidn.Start(oidn.SMALL_CLEAN_HDR, oidn.BASE, ("enc_conv0", "dec_conv1a"), EXTRA),
-    "usual": oidn.Start(oidn.LARGE_HDR, oidn.LARGE, ("enc_conv1a", "dec_conv1a"), EXTRA, frozen=LOWEST),
+#: By the size of :class:`research.training.joint.JointFusion`: what training starts from, its shape, and convolutions
+#: that are not trained. Of the large network, the two lowest levels have two thirds of all weights.
+STARTS: dict[str, tuple[str, oidn.Shape, tuple[str, ...]]] = {
+    "small": (oidn.SMALL_CLEAN_HDR, oidn.BASE, ()),
+    "usual": (oidn.LARGE_HDR, oidn.LARGE, LOWEST),
 }
 
 
@@ -39,7 +37,8 @@ class MeanDenoiser(oidn.FineTunedUNet):
     """The denoiser of both renders' mean. Its size is a key of ``STARTS``."""
 
     def __init__(self, size: str = "usual") -> None:
-        super().__init__(STARTS[size])
+        network, shape, frozen = STARTS[size]
+        super().__init__(network, shape, extra=1, frozen=frozen)  # the extra input channel is the noise
 
     def forward(self, mean: Tensor, noise: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
         """Denoise the mean (N, 3, h, w) of both renders, log-encoded.
@@ -83,9 +82,8 @@ class LayerDenoisers(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.albedo, self.normal = (
-            oidn.FineTunedUNet(oidn.untouched(name, oidn.BASE)) for name in (oidn.ALBEDO_BASE, oidn.NORMAL_BASE)
-        )
+        self.albedo = oidn.FineTunedUNet(oidn.ALBEDO_BASE, oidn.BASE)
+        self.normal = oidn.FineTunedUNet(oidn.NORMAL_BASE, oidn.BASE)
 
     def forward(self, albedo: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
         """Denoise an albedo in [0, 1] and a normal in [-1, 1], (N, 3, H, W) each; both results are in [0, 1]."""

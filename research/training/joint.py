@@ -22,7 +22,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -133,11 +133,9 @@ class JointFusion(nn.Module):
             columns = [*self.kept.get(before, range(everything)), *columns[everything:]]
         return rows, columns
 
-    def differences(self) -> Iterator[nn.Parameter]:
-        """Yield the parameters that are added to pretrained ones."""
-        for convs in (self.convs, *([self.mean_denoiser.convs] if self.mean_denoiser is not None else [])):
-            for conv in convs.values():
-                yield from conv.differences()
+    def differences(self) -> list[nn.Parameter]:
+        """Return the parameters that are added to pretrained ones."""
+        return [p for name, p in self.named_parameters() if "convs." in name and not name.endswith(".extra")]
 
     def initial_state(self) -> dict[str, Tensor]:
         """Return the state of a new network without its random weights, and without the head of the expected error."""

@@ -203,10 +203,6 @@ class FineTunedConv(nn.Module):
         self.bias = None if frozen else nn.Parameter(torch.zeros_like(bias))
         self.extra = nn.Parameter(weight.new_zeros(len(weight), extra, 3, 3)) if extra else None
 
-    def differences(self) -> list[nn.Parameter]:
-        """Return the parameters that are added to pretrained ones."""
-        return [parameter for parameter in (self.weight, self.bias) if parameter is not None]
-
     def total(self) -> tuple[Tensor, Tensor]:
         """Return weight and bias of the convolution: pretrained parameters plus differences."""
         weight, bias = self.pretrained_weight, self.pretrained_bias
@@ -228,38 +224,26 @@ class FineTunedConv(nn.Module):
         return result
 
 
-@dataclass(frozen=True)
-class Start:
-    """What the fine-tuning of a whole network starts from."""
-
-    network: str
-    """A key of ``NETWORKS``."""
-    shape: Shape
-    readers: tuple[str, ...]
-    """The convolutions that read the input."""
-    extra: int
-    """Input channels that the pretrained network lacks."""
-    frozen: tuple[str, ...] = ()
-    """Convolutions that keep the pretrained weights."""
-
-
-def untouched(network: str, shape: Shape) -> Start:
-    """Return a network as it is in Open Image Denoise, to be run and not to be trained."""
-    return Start(network, shape, (), 0, tuple(convolutions(pretrained_weights(network))))
-
-
 class FineTunedUNet(nn.Module):
-    """A network of Open Image Denoise, fine-tuned to read further channels after its own."""
+    """A network of Open Image Denoise, fine-tuned to read further channels after its own.
 
-    def __init__(self, start: Start) -> None:
+    Args:
+        network: a key of ``NETWORKS``.
+        shape: its layout.
+        extra: input channels that the pretrained network lacks.
+        frozen: convolutions that keep the pretrained weights; by default all of them.
+    """
+
+    def __init__(self, network: str, shape: Shape, extra: int = 0, frozen: Sequence[str] | None = None) -> None:
         super().__init__()
-        self.start = start
-        pretrained = pretrained_weights(start.network)
+        self.network, self.shape = network, shape
+        pretrained = pretrained_weights(network)
+        readers = shape.down[0][0], shape.up[-1][0]  # of the input
         self.convs: Any = nn.ModuleDict()  # of FineTunedConv
         for name in convolutions(pretrained):
             weight, bias = pretrained[f"{name}.weight"], pretrained[f"{name}.bias"]
-            extra = start.extra if name in start.readers else 0
-            self.convs[name] = FineTunedConv(weight, bias, extra, frozen=name in start.frozen)
+            keeps = frozen is None or name in frozen
+            self.convs[name] = FineTunedConv(weight, bias, extra if name in readers else 0, frozen=keeps)
 
     def run(self, image: Tensor) -> Tensor:
         """Run the network on an image (N, C, H, W); H and W are multiples of 16."""
@@ -268,7 +252,7 @@ class FineTunedUNet(nn.Module):
             return F.relu(self.convs[name](values))
 
         dtype = next(itertools.chain(self.convs.parameters(), self.convs.buffers())).dtype
-        return run_unet_on_tensors(self.start.shape, [image.to(dtype)], conv).float()
+        return run_unet_on_tensors(self.shape, [image.to(dtype)], conv).float()
 
     def weights(self) -> dict[str, Tensor]:
         """Return the weights and biases of all convolutions, by Open Image Denoise's names."""

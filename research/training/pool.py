@@ -41,7 +41,7 @@ from research.training.data import Batch, SampleTensors, Sampling, ViewTensors, 
 from research.training.denoisers import LayerDenoisers, denoise_mean
 from research.training.encoding import compress, exposure_of, log_decode, log_encode, log_to_pu, pu_to_log
 from research.training.joint import FEATURES, JointFusion
-from research.training.oidn import LARGE, LARGE_HDR, FineTunedUNet, untouched
+from research.training.oidn import LARGE, LARGE_HDR, FineTunedUNet
 from research.training.render_mean import mean_and_noise
 
 log = logging.getLogger(__name__)
@@ -91,7 +91,7 @@ class Denoisers:
     @functools.cached_property
     def large(self) -> FineTunedUNet:
         """OIDN's large network."""
-        return self.moved(FineTunedUNet(untouched(LARGE_HDR, LARGE)))
+        return self.moved(FineTunedUNet(LARGE_HDR, LARGE))
 
     def moved(self, network: M) -> M:
         """Return a network without gradients, on the device."""

@@ -59,8 +59,8 @@ def main() -> None:
     if exact is None:
         raise SystemExit(f"{args.checkpoint}: the size large has no denoiser of both renders' mean of its own")
     codes = [denoiser_codes(*images) for images in islice(means(args.views, "train"), IMAGES)]
-    model = Graph(quantise_mean_denoiser(exact.start.shape, exact.weights(), codes)).model()
-    helper.set_model_props(model, {"provenance": json.dumps(provenance(exact.start.network))})
+    model = Graph(quantise_mean_denoiser(exact.shape, exact.weights(), codes)).model()
+    helper.set_model_props(model, {"provenance": json.dumps(provenance(exact.network))})
     onnx.save(model, path)
     differences = []
     for images in islice(means(args.views, "validation"), 24):

@@ -46,10 +46,9 @@ def varied(images: Sequence[Tensor]) -> list[Tensor]:
 
 def fitted(network: FineTunedUNet, slices_out: int, images: Sequence[Activations]) -> tuple[Fit, list[Tensor]]:
     """Quantise a network; also return its exact outputs (1, 3, H, W)."""
-    shape = network.start.shape
-    fit = Fit(shape, network.weights(), slices_out)
+    fit = Fit(network.shape, network.weights(), slices_out)
     exact, codes = ([getattr(image, kind)[0] for image in images] for kind in ("exact", "codes"))
-    result = run_unet_on_activations(shape, [Activations(exact, codes, images[0].layout)], fit.conv)
+    result = run_unet_on_activations(network.shape, [Activations(exact, codes, images[0].layout)], fit.conv)
     return fit, [image[:, :3].clamp(0, 1) for image in result.exact]
 
 

@@ -439,24 +439,34 @@ def random_orthogonal(rng: np.random.Generator, determinant: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Batches(IterableDataset):
-    """Endless random batches of a folder's training views."""
+    """Endless random batches of the views that a folder has when they begin, the same for each seed."""
 
     folder: Path
-    scales: tuple[int, ...]
+    scales: Sequence[int]
     """Of each batch, one of these at random."""
     patch: int
     """Width and height of a patch in HRLS pixels."""
     batch: int
     """Pairs per batch."""
-    sampling: Sampling
-    seed: int
-    device: torch.device
     prepare: Prepare | None = None
+    sampling: Sampling = Sampling()
+    split: str = "train"
+    without_reference: bool = False
+    """Also of views that have no reference; their targets are not to be read."""
+    seed: int = 0
+    device: torch.device = CPU
 
     def __iter__(self) -> Iterator[Batch]:
         """Yield batches without end."""
-        drawn = self.folder, "train", self.scales, self.patch, self.batch, self.prepare, self.sampling
-        return fixed_batches(*drawn, seed=self.seed, device=self.device)
+        rng, folder = np.random.default_rng(self.seed), Folder(self.folder)
+        tensors = view_tensors(folder, self.split, self.device)
+        if self.without_reference:
+            tensors += view_tensors(folder, NO_REFERENCE, self.device)
+        while True:
+            with torch.no_grad():
+                scale = int(rng.choice(self.scales))
+                pairs = draw(tensors, scale, self.patch, self.batch, rng, self.sampling, self.prepare)
+            yield pairs
 
     def loader(self) -> DataLoader:
         """Load batches: on a CPU four ahead of training, in a process of their own."""
@@ -476,25 +486,6 @@ def view_tensors(folder: Folder, split: str, device: torch.device) -> list[ViewT
     """Open the views of a split as tensors on a device, those with single samples too."""
     passes = [ViewTensors.of(view, device) for view in folder.split(split)]
     return [*passes, *(SampleTensors.of(view, device) for view in folder.sample_views(split))]
-
-
-def fixed_batches(
-    views: Path, split: str, scales: Sequence[int], patch: int, batch: int, prepare: Prepare | None = None,
-    sampling: Sampling = Sampling(), *, seed: int = 0, device: torch.device = CPU, without_reference: bool = False,
-) -> Iterator[Batch]:  # fmt: skip
-    """Yield endless batches of the views that a folder has now, the same for each seed.
-
-    Args:
-        without_reference: also of views that have none; their targets are not to be read.
-    """
-    rng, folder = np.random.default_rng(seed), Folder(views)
-    tensors = view_tensors(folder, split, device)
-    if without_reference:
-        tensors += view_tensors(folder, NO_REFERENCE, device)
-    while True:
-        with torch.no_grad():
-            pairs = draw(tensors, int(rng.choice(scales)), patch, batch, rng, sampling, prepare)
-        yield pairs
 
 
 def to_tensor(image: Array, device: torch.device) -> Tensor:

@@ -31,7 +31,7 @@ def fit(network: JointFusion, views: Path, scales: list[int], prepare: data.Prep
     network.error.requires_grad_(True)
     optimizer = torch.optim.Adam(network.error.parameters(), lr=LEARNING_RATE)
     schedule = LambdaLR(optimizer, lambda step: lr_factor(step / steps))
-    batches = data.fixed_batches(views, "train", scales, PATCH, BATCH, prepare)
+    batches = data.Batches(views, scales, PATCH, BATCH, prepare)
     last = []
     for step, pair in zip(range(steps), batches, strict=False):
         with torch.autocast("cpu", torch.bfloat16):

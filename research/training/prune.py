@@ -81,7 +81,7 @@ def main() -> None:
     network, state = checkpoints.load_joint(args.checkpoint)
     if network.size == "large":
         raise SystemExit(f"{args.checkpoint}: not a joint network of the size usual or small")
-    pairs = list(itertools.islice(data.fixed_batches(args.data, "train", [2], PATCH, 1, with_mean), PAIRS))
+    pairs = list(itertools.islice(data.Batches(args.data, [2], PATCH, 1, with_mean), PAIRS))
     for name, _, count in (part.partition("=") for part in args.keep):
         network = pruned(network, name, int(count), pairs)
     state |= {"ema": network.state_dict(), "config": network.config}

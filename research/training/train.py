@@ -30,7 +30,7 @@ from oiio_msspl.exr.atomic import replacing
 from research.datagen.views import Folder, SampleView, View
 from research.training import checkpoints, losses
 from research.training.checkpoints import NETWORKS, Network, preparation, run
-from research.training.data import Batches, Sampling, spp_range
+from research.training.data import Batches, spp_range
 from research.training.joint import SIZES, JointFusion
 from research.training.paper import MultiResolutionFusion
 from research.training.pool import PooledBatches
@@ -161,7 +161,8 @@ class Run:
         if self.args.pool:
             spread = None if self.args.noise is None else self.args.noise == "spread"
             return PooledBatches(self.args.pool, *sizes, seed, self.device, spread=spread)
-        return Batches(self.args.data, *sizes, Sampling(), seed, self.device, preparation(self.args.network))
+        prepare = preparation(self.args.network)
+        return Batches(self.args.data, *sizes, prepare, seed=seed, device=self.device)
 
     def new_schedule(self) -> LambdaLR:
         """Set the learning rate by the clock, at every ``step()`` of the schedule."""

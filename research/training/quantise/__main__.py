@@ -24,7 +24,7 @@ from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.runtime import load_network
 from research.training import CHECKPOINTS
 from research.training.checkpoints import load_joint
-from research.training.data import fixed_batches
+from research.training.data import Batches
 from research.training.oidn import provenance
 from research.training.ops import box_downsample
 from research.training.quantise.codes import OUTPUT_SLICES, denoiser_codes, log_encoded_of_code
@@ -40,7 +40,7 @@ IMAGES, PATCH = 96, 256
 
 def means(views: Path, split: str) -> Iterator[tuple[Tensor, ...]]:
     """Yield colour, noise, albedo and normal of both renders' mean, from views as training draws them."""
-    for batch in fixed_batches(views, split, SCALES, PATCH, 1, with_mean):
+    for batch in Batches(views, SCALES, PATCH, 1, with_mean, split=split):
         lrhs, hrls = batch["lrhs"], batch["hrls"]
         scale = hrls.shape[-1] // lrhs.shape[-1]
         aovs = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))

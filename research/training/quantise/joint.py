@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import HRLS_FEATURES
-from research.training.data import Prepare, Sampling, fixed_batches
+from research.training.data import Batches, Prepare, Sampling
 from research.training.encoding import log_to_pu
 from research.training.joint import DECODED, FEATURES, MARGIN, OUTPUTS, JointFusion, blend
 from research.training.ops import log2_scale, upsample
@@ -88,8 +88,7 @@ def calibration_pairs(
         prepare: see :func:`research.training.denoisers.with_denoised_mean`.
         spread: of views with single samples, only pixel filters that spread noise; otherwise only others.
     """
-    sampling = Sampling(spread_noise=spread)
-    batches = fixed_batches(views, "train", scales, PATCH, 1, prepare, sampling=sampling, without_reference=True)
+    batches = Batches(views, scales, PATCH, 1, prepare, Sampling(spread_noise=spread), without_reference=True)
     return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in islice(batches, count)]
 
 

@@ -319,7 +319,7 @@ def test_run_ends_on_sigterm_and_continues(views: Path, tmp_path: Path) -> None:
 
 def test_the_loader_draws_what_the_data_set_does(views: Path) -> None:
     """In its own process, from the same seed; and that process ends with the iterator."""
-    pairs = data.Batches(views, (2,), 16, 1, data.Sampling(), 0, torch.device("cpu"))
+    pairs = data.Batches(views, (2,), 16, 1)
     loaded = iter(pairs.loader())
     for _, expected, batch in zip(range(6), pairs, loaded, strict=False):
         assert batch["lrhs"].shape == (1, 3, 8, 8)

@@ -39,6 +39,7 @@ from research.training.paper import LRHS_CHANNELS
 
 #: Features of the HRLS that the network reads.
 FEATURES = (RGB, ALBEDO, NORMAL)
+HRLS_CHANNELS = sum(HRLS_FEATURES[name] for name in FEATURES)
 #: By size: the network of Open Image Denoise from which the U-Net starts, and its shape.
 SIZES = {
     "small": (oidn.SMALL_HDR, oidn.BASE),
@@ -93,7 +94,7 @@ class JointFusion(nn.Module):
         super().__init__()
         self.kept, self.size, self.spread = dict(kept or {}), size, spread
         self.config: dict[str, Any] = {"kept": self.kept, "size": size, "spread": spread}
-        self.lrhs_channels, self.hrls_channels = 2 * LRHS_CHANNELS, sum(HRLS_FEATURES[name] for name in FEATURES)
+        self.lrhs_channels, self.hrls_channels = 2 * LRHS_CHANNELS, HRLS_CHANNELS
         network, self.shape = SIZES[size]
         self.pretrained = oidn.pretrained_weights(network)
         # The large size reads the mean that the usual one has denoised

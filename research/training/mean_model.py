@@ -16,11 +16,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import onnx
-from onnx import TensorProto, helper
+from onnx import helper
 
 from oiio_msspl.model.catalogue import MEAN_MODEL
 from oiio_msspl.model.contract import METADATA_KEY, SPREAD, Contract
 from oiio_msspl.model.devices import gpu_file
+from research.training.tracing import image_info
 
 #: Peak memory of a tile in bytes for each of its pixels.
 BYTES_PER_PIXEL = 800
@@ -43,9 +44,8 @@ def mean_model(path: Path) -> onnx.ModelProto:
             needed |= set(node.input)
             nodes.insert(0, node)
     tensors = [tensor for tensor in graph.initializer if tensor.name in needed]
-    info = helper.make_tensor_value_info
-    outputs = [info(FUSED, TensorProto.FLOAT, [1, 3, "h", "w"])]
-    inputs = [info(name, TensorProto.FLOAT, [1, n, "h", "w"] if n else []) for name, n in contract.inputs.items()]
+    inputs = [image_info(name, channels, "hw") for name, channels in contract.inputs.items()]
+    outputs = [image_info(FUSED, 3, "hw")]
     provenance = contract.provenance | {"cut_from": contract.name}
     name = f"{MEAN_MODEL}{SPREAD if contract.denoiser.endswith(SPREAD) else ''}-x1"
     contract = replace(contract, name=name, scale=1, bytes_per_pixel=BYTES_PER_PIXEL, provenance=provenance)

@@ -34,20 +34,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from oiio_msspl.aovs.features import HRLS_FEATURES
 from research.datagen.views import NO_REFERENCE, Folder, SampleView, View
 from research.training import checkpoints
 from research.training.data import Batch, SampleTensors, Sampling, ViewTensors, draw, turned
 from research.training.denoisers import LayerDenoisers, denoise_mean
 from research.training.encoding import compress, exposure_of, log_decode, log_encode, log_to_pu, pu_to_log
-from research.training.joint import FEATURES, JointFusion
+from research.training.joint import HRLS_CHANNELS, JointFusion
 from research.training.oidn import LARGE, LARGE_HDR, FineTunedUNet
 from research.training.render_mean import mean_and_noise
 
 log = logging.getLogger(__name__)
 
-#: Channels of the HRLS that pairs keep: those that `joint` reads.
-CHANNELS = sum(HRLS_FEATURES[name] for name in FEATURES)
 #: Widths of a view are cut to a multiple of this.
 ALIGNMENT = 128
 #: Share of the pairs in which parts of both renders have more samples.
@@ -176,7 +173,7 @@ def draw_pairs(
         sampling = Sampling(spread_noise=spread if prepares else None, uneven=UNEVEN)
         batch = draw([tensors], int(rng.choice(scales)), patch, 1, rng, sampling)
         lrhs, hrls = batch["lrhs"], batch["hrls"]
-        lrhs, hrls = torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), hrls[:, :CHANNELS]
+        lrhs, hrls = torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), hrls[:, :HRLS_CHANNELS]
         target, rendered = batch["target"], hrls
         if denoisers is not None and prepares:
             lrhs, hrls = denoisers.prepared(lrhs, hrls, spread)

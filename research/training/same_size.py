@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper
+from onnx import helper
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -41,7 +41,7 @@ from research.training.ops import box_downsample, upsample
 from research.training.quantise.graph import Nodes
 from research.training.render_mean import NOISE_GAIN, Images, mean_of_renders
 from research.training.tracing import traced
-from research.training.whole_model import ENTER, Enter, encoded, example
+from research.training.whole_model import ENTER, Enter, encoded, example, inputs_of
 
 #: What comes out of :class:`EnterHalves` and of :class:`EnterMean`; ``encoded.`` precedes these names in the graph.
 HALVES = ("lrhs", "hrls", "colour", "noise", "albedo", "normal")
@@ -199,13 +199,7 @@ def _finished(
     tensors: list[onnx.TensorProto],
 ) -> onnx.ModelProto:  # fmt: skip
     """Give a model another graph and contract."""
-    low = "HW" if contract.scale == ONE_SIZE else "hw"
-    shapes = {name: [1, count, *(low if name.startswith("lrhs") else "HW")] for name, count in contract.inputs.items()}
-    values = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, shapes[name] if count else [])
-        for name, count in contract.inputs.items()
-    ]
-    model.graph.CopyFrom(helper.make_graph(nodes, contract.name, values, outputs, tensors))
+    model.graph.CopyFrom(helper.make_graph(nodes, contract.name, inputs_of(contract), outputs, tensors))
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     return model
 

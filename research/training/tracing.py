@@ -7,6 +7,7 @@ from typing import Any
 
 import onnx
 import torch
+from onnx import TensorProto, helper
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -46,6 +47,11 @@ def prepend(graph: onnx.GraphProto, nodes: list[onnx.NodeProto]) -> None:
     nodes = [*nodes, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)
+
+
+def image_info(name: str, channels: int, size: str = "HW") -> onnx.ValueInfoProto:
+    """Describe images (1, channels, H, W) of any size, or a number if it has no channels."""
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, channels, *size] if channels else [])
 
 
 def _strip_traces(model: onnx.ModelProto) -> None:

@@ -20,19 +20,19 @@ from pathlib import Path
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper
+from onnx import helper
 from onnx.external_data_helper import set_external_data
 from torch import Tensor, nn
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.model.contract import DENOISERS, METADATA_KEY, Contract
+from oiio_msspl.model.contract import DENOISERS, METADATA_KEY, ONE_SIZE, Contract
 from oiio_msspl.model.encoding import MAX_ENCODED
 from research.training import CHECKPOINTS
 from research.training.encoding import encoded_feature, exposed_feature, log_decode, log_encode
 from research.training.quantise.codes import INPUT_SLICES, OUTPUT_SLICES, log_encoded_of_code
 from research.training.quantise.graph import Nodes
 from research.training.render_mean import Images, mean_of_renders
-from research.training.tracing import traced
+from research.training.tracing import image_info, traced
 
 #: Prefixes of tensors in the graph of a model.
 ENTER, NETWORK, DENOISER = "enter.", "network.", "denoiser."
@@ -106,57 +106,62 @@ class InTorch(nn.Module):
         return fused
 
 
-class _Whole(Nodes):
-    """The graph of a model."""
+def whole_model(network: onnx.ModelProto, contract: Contract, denoiser: onnx.ModelProto | None) -> onnx.ModelProto:
+    """Return the model of a network.
 
-    def __init__(self, network: onnx.ModelProto, contract: Contract, denoiser: onnx.ModelProto | None) -> None:
-        super().__init__()
-        self._contract = contract
-        names = ["lrhs", "hrls", *(["colour", "noise", "albedo", "normal"] if denoiser is not None else [])]
-        inputs = example(contract, 4 * contract.alignment, 6 * contract.alignment)
-        enter = traced(Enter(contract), (list(inputs.values()),), list(inputs), names, contract.alignment)
-        self.embed(enter, ENTER, {name: f"encoded.{name}" for name in names})
-        lrhs, hrls, *mean = (f"encoded.{name}" for name in names)
-        if denoiser is not None:
-            self._denoise(denoiser, mean)
-            lrhs = self.add("Concat", [lrhs, "mean.denoised"], "encoded.both", axis=1)
-        self.embed(network, NETWORK, {"lrhs": lrhs, "hrls": hrls, "fused": "encoded.fused"})
-        ends = inputs["hrls.rgb"], inputs["exposure"]
-        leave = traced(Leave(), ends, ["encoded", "exposure"], ["fused"], contract.scale * contract.alignment)
-        self.embed(leave, "leave.", {"encoded": "encoded.fused"})
-        self._results = {value.name: value.type.tensor_type.shape.dim[1].dim_value for value in network.graph.output}
+    Args:
+        network: its inputs are ``lrhs`` and ``hrls``, encoded; outputs are ``fused``, log-encoded, and others, which
+            the model returns as they are.
+        contract: of the model.
+        denoiser: of both renders' mean, if the contract has one. Its input is ``layers`` and its output ``codes``
+            (:mod:`research.training.quantise.codes`), or images, with the output ``denoised``.
+    """
+    graph = Nodes()
+    names = ["lrhs", "hrls", *(["colour", "noise", "albedo", "normal"] if denoiser is not None else [])]
+    inputs = example(contract, 4 * contract.alignment, 6 * contract.alignment)
+    enter = traced(Enter(contract), (list(inputs.values()),), list(inputs), names, contract.alignment)
+    graph.embed(enter, ENTER, {name: f"encoded.{name}" for name in names})
+    lrhs, hrls, *mean = (f"encoded.{name}" for name in names)
+    if denoiser is not None:
+        _denoise(graph, denoiser, mean)
+        lrhs = graph.add("Concat", [lrhs, "mean.denoised"], "encoded.both", axis=1)
+    graph.embed(network, NETWORK, {"lrhs": lrhs, "hrls": hrls, "fused": "encoded.fused"})
+    ends = inputs["hrls.rgb"], inputs["exposure"]
+    leave = traced(Leave(), ends, ["encoded", "exposure"], ["fused"], contract.scale * contract.alignment)
+    graph.embed(leave, "leave.", {"encoded": "encoded.fused"})
+    results = {value.name: value.type.tensor_type.shape.dim[1].dim_value for value in network.graph.output}
+    outputs = [image_info(name, count) for name, count in results.items()]
+    model = graph.finished(contract.name, inputs_of(contract), outputs)
+    _share_equal_tensors(model.graph)
+    helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+    return model
 
-    def _denoise(self, denoiser: onnx.ModelProto, images: list[str]) -> None:
-        """Add the denoiser of both renders' mean, in 8 bits or not."""
-        names = [value.name for value in denoiser.graph.input]
-        if names != ["layers"]:
-            self.embed(denoiser, DENOISER, {**dict(zip(names, images, strict=True)), "denoised": "mean.denoised"})
-            return
-        colour, noise, albedo, normal = images
-        half, step = self.constant("half", np.float32(0.5)), self.constant("step", np.float32(1 / 255))
-        normal = self.add("Add", [self.add("Mul", [normal, half], "mean.scaled"), half], "mean.shifted")
-        rest = [self.add("QuantizeLinear", [i, step, "zero"], f"{i}.codes") for i in (albedo, normal, noise)]
-        slices = self.add("Concat", self.slices(self.log_to_pu(colour), INPUT_SLICES), "mean.slices", axis=1)
-        # The slices of each colour lie side by side.
-        order = self.constant("by_colour", np.arange(3 * INPUT_SLICES).reshape(INPUT_SLICES, 3).T.ravel())
-        layers = self.packed([self.add("Gather", [slices, order], "mean.by_colour", axis=1), *rest], "mean.layers")
-        self.embed(denoiser, DENOISER, {"layers": layers, "codes": "mean.sums"})
-        self.constant("of_code", log_encoded_of_code(OUTPUT_SLICES))
-        pixels = self.look_up("of_code", "mean.sums", "mean.pixels")
-        self.add("Transpose", [pixels], "mean.denoised", perm=[0, 3, 1, 2])
 
-    def model(self) -> onnx.ModelProto:
-        """Return the model with its contract."""
-        info, contract = helper.make_tensor_value_info, self._contract
-        inputs = [
-            info(name, TensorProto.FLOAT, [1, count, *("hw" if name.startswith("lrhs") else "HW")] if count else [])
-            for name, count in contract.inputs.items()
-        ]
-        outputs = [info(name, TensorProto.FLOAT, [1, count, "H", "W"]) for name, count in self._results.items()]
-        model = self.finished(contract.name, inputs, outputs)
-        _share_equal_tensors(model.graph)
-        helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
-        return model
+def inputs_of(contract: Contract) -> list[onnx.ValueInfoProto]:
+    """Describe the inputs of a contract. Renders of one size have the same height and width."""
+    low = "HW" if contract.scale == ONE_SIZE else "hw"
+    sizes = {"lrhs": low, "hrls": "HW"}
+    return [image_info(name, count, sizes.get(name[:4], "")) for name, count in contract.inputs.items()]
+
+
+def _denoise(graph: Nodes, denoiser: onnx.ModelProto, images: list[str]) -> None:
+    """Add the denoiser of both renders' mean to a graph, in 8 bits or not."""
+    names = [value.name for value in denoiser.graph.input]
+    if names != ["layers"]:
+        graph.embed(denoiser, DENOISER, {**dict(zip(names, images, strict=True)), "denoised": "mean.denoised"})
+        return
+    colour, noise, albedo, normal = images
+    half, step = graph.constant("half", np.float32(0.5)), graph.constant("step", np.float32(1 / 255))
+    normal = graph.add("Add", [graph.add("Mul", [normal, half], "mean.scaled"), half], "mean.shifted")
+    rest = [graph.add("QuantizeLinear", [i, step, "zero"], f"{i}.codes") for i in (albedo, normal, noise)]
+    slices = graph.add("Concat", graph.slices(graph.log_to_pu(colour), INPUT_SLICES), "mean.slices", axis=1)
+    # The slices of each colour lie side by side.
+    order = graph.constant("by_colour", np.arange(3 * INPUT_SLICES).reshape(INPUT_SLICES, 3).T.ravel())
+    layers = graph.packed([graph.add("Gather", [slices, order], "mean.by_colour", axis=1), *rest], "mean.layers")
+    graph.embed(denoiser, DENOISER, {"layers": layers, "codes": "mean.sums"})
+    graph.constant("of_code", log_encoded_of_code(OUTPUT_SLICES))
+    pixels = graph.look_up("of_code", "mean.sums", "mean.pixels")
+    graph.add("Transpose", [pixels], "mean.denoised", perm=[0, 3, 1, 2])
 
 
 def _share_equal_tensors(graph: onnx.GraphProto) -> None:
@@ -183,19 +188,6 @@ def example(contract: Contract, height: int, width: int, seed: int = 0) -> dict[
         shape = (1, count, height * factor, width * factor) if count else ()
         inputs[name] = torch.rand(shape, generator=generator)
     return inputs
-
-
-def whole_model(network: onnx.ModelProto, contract: Contract, denoiser: onnx.ModelProto | None) -> onnx.ModelProto:
-    """Return the model of a network.
-
-    Args:
-        network: its inputs are ``lrhs`` and ``hrls``, encoded; outputs are ``fused``, log-encoded, and others, which
-            the model returns as they are.
-        contract: of the model.
-        denoiser: of both renders' mean, if the contract has one. Its input is ``layers`` and its output ``codes``
-            (:mod:`research.training.quantise.codes`), or images, with the output ``denoised``.
-    """
-    return _Whole(network, contract, denoiser).model()
 
 
 def denoiser_file(mode: str) -> str:

@@ -10,20 +10,19 @@ from pathlib import Path
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.aovs.features import HRLS_FEATURES
 from research.training.data import Batches, Prepare, Sampling
 from research.training.encoding import log_to_pu
-from research.training.joint import DECODED, FEATURES, MARGIN, OUTPUTS, JointFusion, blend
+from research.training.joint import DECODED, HRLS_CHANNELS, MARGIN, OUTPUTS, JointFusion, blend
 from research.training.ops import log2_scale, upsample
 from research.training.paper import LRHS_CHANNELS
 from research.training.quantise import gptq
 from research.training.quantise.codes import log_encoded_of_code, sliced
 from research.training.quantise.graph import Graph
 from research.training.quantise.layers import Networks, add_layers
+from research.training.tracing import image_info
 
 #: Calibration pairs, and their width in HRLS pixels.
 PAIRS, PATCH = 64, 256
@@ -127,82 +126,62 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
 # The graph
 
 
-class JointGraph(Graph):
-    """The whole graph: tensors are (1, C, H, W) outside the U-Net, (1, H, W, C) within.
-
-    Args:
-        fit: see :func:`fitted`.
-        scale: of the model.
-        layers: denoise albedo and normal first, see :mod:`research.training.quantise.layers`.
-    """
-
-    def __init__(self, fit: gptq.Fit, scale: int, layers: Networks | None = None) -> None:
-        super().__init__(fit)
-        self._scale, self._layers = scale, layers
-        self.initializers["unseen"] = log_encoded_of_code(SLICES_OUT)
-
-    def whole(
-        self, mixing: onnx.ModelProto, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
-    ) -> onnx.ModelProto:
-        """Return the model with the graph of :class:`Blend`, whose inputs have the names of tensors made here."""
-        colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
-        step, half_step = self.constant("step", np.float32(1 / 255)), self.constant("half_step", np.float32(1 / 127.5))
-        zeros = self.zeros(albedo)
-        if self._layers:
-            add_layers(self, self._layers, albedo, normal, zeros)
-            albedo = "albedo"
-            normal_codes = self.add("QuantizeLinear", ["normal", step, "zero"], "normal.rounded")
-        else:
-            middle = self.constant("middle", np.uint8(gptq.SIGNED_ZERO))
-            normal_codes = self.add("QuantizeLinear", [normal, half_step, middle], "normal.rounded")
-        albedo_codes = self.add("QuantizeLinear", [albedo, step, "zero"], "albedo.rounded")
-        colours = self.slices(self.log_to_pu(colour), HRLS_SLICES)
-        full = self.packed([*colours, albedo_codes, normal_codes, zeros], "full")
-        low, mean = self.split("lrhs", {"colour": LRHS_CHANNELS, "mean": LRHS_CHANNELS})
-        means = self.slices(self.log_to_pu(mean), MEAN_SLICES)
-        half = self.packed([*means, *self.slices(self.log_to_pu(low), LRHS_SLICES), self.zeros(low)], "half")
-        if self._scale > 2:
-            half = self.repeat(half, 16, self._scale // 2)
-        sums = self.colours([full, half], "sums")
-        pixels = self.look_up("unseen", sums, "denoised.pixels")
-        self.add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
-        last = self.fit.shape.last
-        count = len(self.fit.layers[last].step) - gptq.COLOURS
-        self.add("Identity", [self._planes(last, gptq.COLOURS * SLICES_OUT, count)], "logits0")
-        for level in range(1, self._scale.bit_length()):
-            name = self.conv(f"head{level}", DECODED[level])
-            planes = self._planes(name, 0, len(self.fit.layers[name].step))
-            self.cut(planes, 0, OUTPUTS[level], f"logits{level}")
-            if level == 1:
-                phases = self.cut(planes, OUTPUTS[level], len(self.fit.layers[name].step), "log_error.phases")
-                self.add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
-        self.embed(mixing, "mix.", {"hrls.albedo": albedo})
-        return self.finished("joint", inputs, outputs)
-
-    def _planes(self, layer: str, start: int, count: int) -> str:
-        """Dequantise signed outputs of a layer, as (1, C, H, W)."""
-        # To transpose all channels and cut them then takes half of the time of the other order.
-        planes = self.add("Transpose", [layer], f"{layer}.planes", perm=[0, 3, 1, 2])
-        part = self.cut(planes, start, start + count, f"{layer}.beside")
-        step = self.constant("signed_step", np.float32(2 * gptq.SIGNED_RANGE / 255))
-        middle = self.constant("middle", np.uint8(gptq.SIGNED_ZERO))
-        return self.add("DequantizeLinear", [part, step, middle], f"{layer}.values")
-
-
 def to_onnx(fit: gptq.Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | None = None) -> onnx.ModelProto:
     """Return the graph with inputs ``lrhs`` and ``hrls`` and outputs ``fused`` and ``log_error``.
 
-    With ``layers``, it also returns the denoised ``albedo`` and ``normal``.
+    Tensors are (1, C, H, W) outside the U-Net, (1, H, W, C) within.
 
     Args:
         fit: see :func:`fitted`.
         scale: at most that of the fit.
         mixing: the graph of :class:`Blend` with its ``inputs``, ``logits0`` ... and the output ``fused``.
-        layers: see :class:`JointGraph`.
+        layers: denoise albedo and normal first, see :mod:`research.training.quantise.layers`. They are outputs, too.
     """
-    info, kind = helper.make_tensor_value_info, TensorProto.FLOAT
-    channels = sum(HRLS_FEATURES[name] for name in FEATURES)
-    inputs = [info("lrhs", kind, [1, 2 * LRHS_CHANNELS, "h", "w"]), info("hrls", kind, [1, channels, "H", "W"])]
+    graph = Graph(fit)
+    graph.constant("unseen", log_encoded_of_code(SLICES_OUT))
+    colour, albedo, normal = graph.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
+    step, half_step = graph.constant("step", np.float32(1 / 255)), graph.constant("half_step", np.float32(1 / 127.5))
+    zeros = graph.zeros(albedo)
+    if layers:
+        add_layers(graph, layers, albedo, normal, zeros)
+        albedo = "albedo"
+        normal_codes = graph.add("QuantizeLinear", ["normal", step, "zero"], "normal.rounded")
+    else:
+        middle = graph.constant("middle", np.uint8(gptq.SIGNED_ZERO))
+        normal_codes = graph.add("QuantizeLinear", [normal, half_step, middle], "normal.rounded")
+    albedo_codes = graph.add("QuantizeLinear", [albedo, step, "zero"], "albedo.rounded")
+    colours = graph.slices(graph.log_to_pu(colour), HRLS_SLICES)
+    full = graph.packed([*colours, albedo_codes, normal_codes, zeros], "full")
+    low, mean = graph.split("lrhs", {"colour": LRHS_CHANNELS, "mean": LRHS_CHANNELS})
+    means = graph.slices(graph.log_to_pu(mean), MEAN_SLICES)
+    half = graph.packed([*means, *graph.slices(graph.log_to_pu(low), LRHS_SLICES), graph.zeros(low)], "half")
+    if scale > 2:
+        half = graph.repeat(half, 16, scale // 2)
+    sums = graph.colours([full, half], "sums")
+    pixels = graph.look_up("unseen", sums, "denoised.pixels")
+    graph.add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
+    last = fit.shape.last
+    count = len(fit.layers[last].step) - gptq.COLOURS
+    graph.add("Identity", [_planes(graph, last, gptq.COLOURS * SLICES_OUT, count)], "logits0")
+    for level in range(1, scale.bit_length()):
+        name = graph.conv(f"head{level}", DECODED[level])
+        count = len(fit.layers[name].step)
+        planes = _planes(graph, name, 0, count)
+        graph.cut(planes, 0, OUTPUTS[level], f"logits{level}")
+        if level == 1:
+            phases = graph.cut(planes, OUTPUTS[level], count, "log_error.phases")
+            graph.add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
+    graph.embed(mixing, "mix.", {"hrls.albedo": albedo})
+    inputs = [image_info("lrhs", 2 * LRHS_CHANNELS, "hw"), image_info("hrls", HRLS_CHANNELS)]
     results = {"fused": gptq.COLOURS, "log_error": 1} | ({"albedo": 3, "normal": 3} if layers else {})
-    outputs = [info(name, kind, [1, count, "H", "W"]) for name, count in results.items()]
-    return JointGraph(fit, scale, layers).whole(mixing, inputs, outputs)
+    return graph.finished("joint", inputs, [image_info(name, count) for name, count in results.items()])
+
+
+def _planes(graph: Graph, layer: str, start: int, count: int) -> str:
+    """Dequantise signed outputs of a layer, as (1, C, H, W)."""
+    # To transpose all channels and cut them then takes half of the time of the other order.
+    planes = graph.add("Transpose", [layer], f"{layer}.planes", perm=[0, 3, 1, 2])
+    part = graph.cut(planes, start, start + count, f"{layer}.beside")
+    step = graph.constant("signed_step", np.float32(2 * gptq.SIGNED_RANGE / 255))
+    middle = graph.constant("middle", np.uint8(gptq.SIGNED_ZERO))
+    return graph.add("DequantizeLinear", [part, step, middle], f"{layer}.values")

@@ -26,9 +26,8 @@ from oiio_msspl.model.encoding import find_exposure
 from research.benchmarks import results
 from research.benchmarks.peers import oidn_prefiltered
 from research.benchmarks.results import Row
-from research.datagen.samples import decode
 from research.datagen.views import REF_CELLS, Folder, SampleView
-from research.training.data import SampleTensors
+from research.training.data import SampleTensors, decode_radiance
 from research.training.splat import PixelFilter, apply, filter_reference
 
 #: Spread, then importance sampled.
@@ -66,8 +65,8 @@ def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, spp: i
 
 def pair(view: SampleView, pixel_filter: PixelFilter, spp: int) -> tuple[Render, Render, Array]:
     """Return LRHS, HRLS and reference (h, w, 3), exposed."""
-    tensors = SampleTensors.of(view, torch.device("cpu"))
-    cells = torch.from_numpy(decode(view.arrays["ref"])).movedim(-1, 0)
+    tensors = SampleTensors(view, torch.device("cpu"))
+    cells = decode_radiance(tensors.arrays["ref"][None])[0]
     reference = filter_reference(pixel_filter, cells, REF_CELLS).movedim(0, -1).clamp_min(0).numpy()
     exposure = np.float32(find_exposure(reference))
     renders = []

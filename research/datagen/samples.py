@@ -58,12 +58,6 @@ def encode(radiance: NDArray[Any]) -> NDArray[np.uint32]:
     return (r | g << 9 | b << 18 | exponent.astype(np.uint32) << 27).astype(np.uint32)
 
 
-def decode(stored: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """Undo :func:`encode`: float32 (..., 3)."""
-    mantissas = np.stack([stored >> shift & MANTISSA for shift in (0, 9, 18)], axis=-1).astype(np.float32)
-    return mantissas * (STEP * 2.0 ** (stored >> 27)).astype(np.float32)[..., None]
-
-
 def pack(
     hr: dict[str, np.ndarray],
     lr: dict[str, np.ndarray],

@@ -129,24 +129,15 @@ def _draw_spp(spp: np.ndarray, sampling: Sampling, nearest: bool, rng: np.random
             return n, passes
 
 
-@dataclass(frozen=True)
 class ViewTensors:
-    """The arrays of a view as tensors, see :mod:`research.datagen.views`."""
+    """The arrays of a view as tensors, see :mod:`research.datagen.views`. On a CPU they share the file's memory."""
 
-    hr: Tensor
-    lr: dict[int, Tensor]
-    ref: Tensor
-    lr_spp: np.ndarray
-
-    @classmethod
-    def of(cls, view: View, device: torch.device) -> ViewTensors:
-        """Open a view. On a CPU the tensors share the file's mapped memory."""
-
-        def on_device(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(array).to(device)
-
-        lr = {scale: on_device(passes) for scale, passes in view.lr.items()}
-        return cls(on_device(view.hr), lr, on_device(view.ref), view.lr_spp)
+    def __init__(self, view: View, device: torch.device) -> None:
+        self.device, self.lr_spp = device, view.lr_spp
+        self.hr, self.ref = (torch.from_numpy(array).to(device) for array in (view.hr, view.ref))
+        self.lr = {scale: torch.from_numpy(passes).to(device) for scale, passes in view.lr.items()}
+        self.size: tuple[int, int] = view.ref.shape[:2]
+        """Height and width in HRLS pixels."""
 
     def lrhs(self, passes: np.ndarray, scale: int, *, nearest: bool) -> Tensor:
         """Average passes, as :func:`research.datagen.views.mean_lrhs`: (H/s, W/s, 3).
@@ -164,16 +155,6 @@ class ViewTensors:
             return mean[scale // 2 :: scale, scale // 2 :: scale]
         return box_downsample(mean.permute(2, 0, 1)[None], scale)[0].permute(1, 2, 0)
 
-    @property
-    def device(self) -> torch.device:
-        """Where the tensors lie."""
-        return self.ref.device
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width in HRLS pixels."""
-        return self.ref.shape[0], self.ref.shape[1]
-
     def draw(self, scale: int, area: Area, light: Tensor, sampling: Sampling, rng: np.random.Generator) -> Rendered:
         """Draw the samples of a pair; its radiance is multiplied by ``light``, (3, 3)."""
         nearest = rng.random() < sampling.nearest
@@ -190,37 +171,28 @@ class ViewTensors:
         return Rendered(features, variance, lrhs @ light, repair(self.ref[area]) @ light)
 
 
-@dataclass(frozen=True)
 class SampleTensors:
-    """The arrays of a view with single samples as tensors, see :mod:`research.datagen.samples`."""
+    """The arrays of a view with single samples as tensors, see :mod:`research.datagen.samples`.
 
-    arrays: dict[str, Tensor]
-    clean_reference: Tensor | None = None
-    """(1, 3, R*H, R*W), in place of the stored reference."""
+    On a CPU they share the file's memory.
+    """
 
-    @classmethod
-    def of(cls, view: SampleView, device: torch.device) -> SampleTensors:
-        """Open a view. On a CPU the tensors share the file's mapped memory."""
+    def __init__(self, view: SampleView, device: torch.device) -> None:
         arrays = {name: array for name, array in view.arrays.items() if name != "meta"}
         signed = {name: a.view(np.int32) if a.dtype == np.uint32 else a for name, a in arrays.items()}
-        return cls({name: torch.from_numpy(array).to(device) for name, array in signed.items()})
-
-    @property
-    def device(self) -> torch.device:
-        """Where the tensors lie."""
-        return self.arrays["ref"].device
+        self.device = device
+        self.arrays = {name: torch.from_numpy(array).to(device) for name, array in signed.items()}
+        self.size: tuple[int, int] = view.hr.shape[1:]
+        """Height and width in HRLS pixels."""
+        self.clean_reference: Tensor | None = None
+        """(1, 3, R*H, R*W), in place of the stored reference."""
 
     def noisy_reference(self) -> tuple[Tensor, Tensor, Tensor] | None:
         """Read colour, albedo and normal, (1, 3, R*H, R*W), of a reference that is to be denoised; else None."""
         if "ref_albedo" not in self.arrays:
             return None
         albedo, normal = (self.arrays[f"ref_{name}"].float().movedim(-1, 0)[None] for name in (ALBEDO, NORMAL))
-        return _decode_radiance(self.arrays["ref"][None]), albedo / 255, normal / 127
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width in HRLS pixels."""
-        return self.arrays["color"].shape[1], self.arrays["color"].shape[2]
+        return decode_radiance(self.arrays["ref"][None]), albedo / 255, normal / 127
 
     def read(self, name: str, samples: Tensor, rows: slice, columns: slice) -> Tensor:
         """Read some samples of an array in a crop: (k, C, h, w); places are (k, h, w, 2)."""
@@ -232,7 +204,7 @@ class SampleTensors:
             return stored.float().movedim(-1, 1) / 255
         if layer == NORMAL:
             return stored.float().movedim(-1, 1) / 127
-        return _decode_radiance(stored)
+        return decode_radiance(stored)
 
     def draw(self, scale: int, area: Area, light: Tensor, sampling: Sampling, rng: np.random.Generator) -> Rendered:
         """Draw a filter and the samples of a pair; its radiance is multiplied by ``light``, (3, 3).
@@ -283,7 +255,7 @@ class SampleTensors:
 
         cells = [slice(w.start * REF_CELLS, w.stop * REF_CELLS) for w in wide]
         if self.clean_reference is None:
-            ref = _decode_radiance(self.arrays["ref"][None, *cells])
+            ref = decode_radiance(self.arrays["ref"][None, *cells])
         else:
             ref = self.clean_reference[:, :, *cells]
         target = filter_reference(pixel_filter, _lit(ref, light)[0], REF_CELLS)[inner].movedim(0, -1)
@@ -301,7 +273,7 @@ def _random_parts(height: int, width: int, rng: np.random.Generator, cell: int =
     return chosen.repeat_interleave(cell, 0).repeat_interleave(cell, 1)[:height, :width]
 
 
-def _decode_radiance(stored: Tensor) -> Tensor:
+def decode_radiance(stored: Tensor) -> Tensor:
     """Decode :func:`research.datagen.samples.encode`: (k, h, w) to (k, 3, h, w)."""
     mantissas = torch.stack([stored >> shift & MANTISSA for shift in (0, 9, 18)], dim=1).float()
     return mantissas * torch.exp2((stored >> 27 & 31).float() + math.log2(STEP))[:, None]
@@ -484,8 +456,8 @@ def _ignore_interrupts(_: int) -> None:
 
 def view_tensors(folder: Folder, split: str, device: torch.device) -> list[ViewTensors | SampleTensors]:
     """Open the views of a split as tensors on a device, those with single samples too."""
-    passes = [ViewTensors.of(view, device) for view in folder.split(split)]
-    return [*passes, *(SampleTensors.of(view, device) for view in folder.sample_views(split))]
+    passes = [ViewTensors(view, device) for view in folder.split(split)]
+    return [*passes, *(SampleTensors(view, device) for view in folder.sample_views(split))]
 
 
 def to_tensor(image: Array, device: torch.device) -> Tensor:

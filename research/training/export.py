@@ -42,7 +42,7 @@ from research.training.oidn import provenance
 from research.training.paper import MultiResolutionFusion
 from research.training.quantise import joint
 from research.training.quantise.layers import Networks, quantised, varied
-from research.training.tracing import IR_VERSION, prepend, traced
+from research.training.tracing import IR_VERSION, network_example, prepend, traced
 from research.training.whole_model import InTorch, example, quantised_denoiser, save, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
@@ -78,12 +78,6 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
     )  # fmt: skip
 
 
-def network_example(network: Network, scale: int, alignment: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return random ``lrhs`` and ``hrls``, as a network reads them."""
-    lrhs = torch.rand(1, network.lrhs_channels, 4 * alignment, 6 * alignment)
-    return lrhs, torch.rand(1, network.hrls_channels, 4 * alignment * scale, 6 * alignment * scale)
-
-
 def denoiser_for(network: JointFusion, mode: str) -> MeanDenoiser:
     """Return the denoiser of both renders' mean for a value of ``Contract.denoiser``.
 
@@ -117,19 +111,6 @@ def to_onnx(network: MultiResolutionFusion, contract: Contract, *, half: bool = 
 
 
 @torch.inference_mode()
-def mixing_of(network: JointFusion, contract: Contract) -> onnx.ModelProto:
-    """Export :class:`research.training.quantise.joint.Blend` for a joint network."""
-    scale, alignment = contract.scale, contract.alignment
-    lrhs, hrls = network_example(network, scale, alignment)
-    levels = range(scale.bit_length())
-    sizes = [[network.heads[level].out_channels, *(side >> level for side in hrls.shape[2:])] for level in levels]
-    image = hrls[:, :3]
-    inputs = (lrhs, image, image.clone(), image.clone(), [torch.rand(1, *size) for size in sizes])
-    names = [*joint.Blend.inputs, *(f"logits{level}" for level in levels)]
-    return traced(joint.Blend(network.size).eval(), inputs, names, ["fused"], alignment)
-
-
-@torch.inference_mode()
 def joint_to_onnx(network: JointFusion, contracts: Sequence[Contract], pairs: Sequence[Pair]) -> list[onnx.ModelProto]:
     """Export a joint network with 8-bit convolutions for several scales.
 
@@ -146,7 +127,7 @@ def joint_to_onnx(network: JointFusion, contracts: Sequence[Contract], pairs: Se
             for (lrhs, _), image, (albedo, normal) in zip(pairs, images, clean, strict=True)
         ]
     fit = joint.fitted(network, max(contract.scale for contract in contracts), pairs)
-    return [joint.to_onnx(fit, contract.scale, mixing_of(network, contract), layers) for contract in contracts]
+    return [joint.to_onnx(network, fit, contract, layers) for contract in contracts]
 
 
 def _space_to_depth(x: Any, downscale_factor: int) -> Any:

@@ -32,10 +32,10 @@ from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import GPU_FOLDER
 from research.training.checkpoints import load_joint
 from research.training.denoisers import ALIGNMENT, MeanDenoiser
-from research.training.export import denoiser_for, network_example
+from research.training.export import denoiser_for
 from research.training.joint import JointFusion
 from research.training.oidn import FineTunedUNet
-from research.training.tracing import prepend, traced
+from research.training.tracing import network_example, prepend, traced
 from research.training.whole_model import SMALL, save, whole_model
 
 #: What is added to the provenance of a file.

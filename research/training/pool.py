@@ -26,7 +26,6 @@ import functools
 import logging
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -160,11 +159,11 @@ def draw_pairs(
     rng = np.random.default_rng([*view.path.name.encode(), count])
     tensors: ViewTensors | SampleTensors
     if isinstance(view, SampleView):
-        tensors = SampleTensors.of(view, device)
+        tensors = SampleTensors(view, device)
         if denoisers is not None and (noisy := tensors.noisy_reference()) is not None:
-            tensors = replace(tensors, clean_reference=denoisers.reference(*noisy))
+            tensors.clean_reference = denoisers.reference(*noisy)
     else:
-        tensors = ViewTensors.of(view, device)
+        tensors = ViewTensors(view, device)
     patch = min(tensors.size) // ALIGNMENT * ALIGNMENT
     prepares = denoisers is not None and bool(denoisers.means)
     pairs = []

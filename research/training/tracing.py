@@ -42,6 +42,12 @@ def traced(
     return model
 
 
+def network_example(network: Any, scale: int, alignment: int) -> tuple[Tensor, Tensor]:
+    """Return random ``lrhs`` and ``hrls``, as a network that fuses them reads them."""
+    lrhs = torch.rand(1, network.lrhs_channels, 4 * alignment, 6 * alignment)
+    return lrhs, torch.rand(1, network.hrls_channels, 4 * alignment * scale, 6 * alignment * scale)
+
+
 def prepend(graph: onnx.GraphProto, nodes: list[onnx.NodeProto]) -> None:
     """Put nodes before those of a graph."""
     nodes = [*nodes, *graph.node]

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from oiio_msspl.model.contract import Contract
 from research.training.data import Batches, Prepare, Sampling
 from research.training.encoding import log_to_pu
 from research.training.joint import DECODED, HRLS_CHANNELS, MARGIN, OUTPUTS, JointFusion, blend
@@ -22,7 +23,7 @@ from research.training.quantise import gptq
 from research.training.quantise.codes import log_encoded_of_code, sliced
 from research.training.quantise.graph import Graph
 from research.training.quantise.layers import Networks, add_layers
-from research.training.tracing import image_info
+from research.training.tracing import image_info, network_example, traced
 
 #: Calibration pairs, and their width in HRLS pixels.
 PAIRS, PATCH = 64, 256
@@ -32,9 +33,6 @@ HRLS_SLICES, MEAN_SLICES, LRHS_SLICES, SLICES_OUT = 3, 3, 2, 9
 
 class Blend(nn.Module):
     """The blending after the U-Net, as a module for the exporter."""
-
-    #: Names of its inputs in the whole graph, except those of the logits.
-    inputs = ("lrhs", "hrls.colour", "hrls.albedo", "denoised")
 
     def __init__(self, size: str) -> None:
         super().__init__()
@@ -126,17 +124,16 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
 # The graph
 
 
-def to_onnx(fit: gptq.Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | None = None) -> onnx.ModelProto:
+def to_onnx(network: JointFusion, fit: gptq.Fit, contract: Contract, layers: Networks | None) -> onnx.ModelProto:
     """Return the graph with inputs ``lrhs`` and ``hrls`` and outputs ``fused`` and ``log_error``.
 
     Tensors are (1, C, H, W) outside the U-Net, (1, H, W, C) within.
 
     Args:
-        fit: see :func:`fitted`.
-        scale: at most that of the fit.
-        mixing: the graph of :class:`Blend` with its ``inputs``, ``logits0`` ... and the output ``fused``.
+        fit: see :func:`fitted`, for the scale of the contract or larger ones.
         layers: denoise albedo and normal first, see :mod:`research.training.quantise.layers`. They are outputs, too.
     """
+    scale = contract.scale
     graph = Graph(fit)
     graph.constant("unseen", log_encoded_of_code(SLICES_OUT))
     colour, albedo, normal = graph.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
@@ -171,10 +168,21 @@ def to_onnx(fit: gptq.Fit, scale: int, mixing: onnx.ModelProto, layers: Networks
         if level == 1:
             phases = graph.cut(planes, OUTPUTS[level], count, "log_error.phases")
             graph.add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
-    graph.embed(mixing, "mix.", {"hrls.albedo": albedo})
+    graph.embed(_blending(network, contract), "mix.", {"hrls.albedo": albedo})
     inputs = [image_info("lrhs", 2 * LRHS_CHANNELS, "hw"), image_info("hrls", HRLS_CHANNELS)]
     results = {"fused": gptq.COLOURS, "log_error": 1} | ({"albedo": 3, "normal": 3} if layers else {})
     return graph.finished("joint", inputs, [image_info(name, count) for name, count in results.items()])
+
+
+def _blending(network: JointFusion, contract: Contract) -> onnx.ModelProto:
+    """Export :class:`Blend`, whose inputs have the names of tensors of the whole graph."""
+    lrhs, hrls = network_example(network, contract.scale, contract.alignment)
+    levels = range(contract.scale.bit_length())
+    sizes = [[network.heads[level].out_channels, *(side >> level for side in hrls.shape[2:])] for level in levels]
+    image = hrls[:, :3]
+    inputs = (lrhs, image, image.clone(), image.clone(), [torch.rand(1, *size) for size in sizes])
+    names = ["lrhs", "hrls.colour", "hrls.albedo", "denoised", *(f"logits{level}" for level in levels)]
+    return traced(Blend(network.size), inputs, names, ["fused"], contract.alignment)
 
 
 def _planes(graph: Graph, layer: str, start: int, count: int) -> str:

@@ -53,7 +53,7 @@ def test_views_that_come_later_are_drawn_by_the_same_command(sample_folder: Path
 def test_parts_of_both_renders_may_have_all_samples(sample_folder: Path) -> None:
     """One sample of noise of variance 1 a pixel, and in some cells of 8 x 8 HRLS pixels the mean of all."""
     (view,) = Folder(sample_folder).sample_views("train")
-    tensors, rng = SampleTensors.of(view, CPU), np.random.default_rng(1)
+    tensors, rng = SampleTensors(view, CPU), np.random.default_rng(1)
     for name in ("color", "lr_color"):
         noise = rng.exponential(1.0, (*tensors.arrays[name].shape, 3)).astype(np.float32)
         tensors.arrays[name] = torch.from_numpy(encode(noise).view(np.int32))
@@ -79,7 +79,7 @@ def test_a_reference_with_noise_is_the_mean_of_itself_and_of_a_denoised_one(tmp_
     noise = np.random.default_rng(1).exponential(0.5, (side, side, 3)).astype(np.float32)
     layers = {"albedo": np.full((side, side, 3), 0.6, np.float32), "normal": np.full((side, side, 3), 0.5, np.float32)}
     (view,) = Folder(write_wall(tmp_path, noise, layers)).sample_views("train")
-    noisy = SampleTensors.of(view, CPU).noisy_reference()
+    noisy = SampleTensors(view, CPU).noisy_reference()
     assert noisy is not None
     found = Denoisers([], CPU).reference(*noisy)
     assert float(found.std() / noisy[0].std()) == pytest.approx(0.5, abs=0.02)

@@ -13,12 +13,12 @@ denoiser must not be scored against its own results.
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.model.encoding import MAX_RADIANCE
 from research.datagen import views
 
@@ -48,10 +48,8 @@ def main() -> None:
         path = views.denoised_reference(view.path)
         if path.exists():
             continue
-        partial = path.with_name(f".{path.name}")
-        with partial.open("wb") as file:
-            np.save(file, np.minimum(denoised(view), MAX_RADIANCE).astype(np.float16))
-        os.replace(partial, path)
+        with replacing(path, overwrite=True) as temporary:
+            np.save(temporary, np.minimum(denoised(view), MAX_RADIANCE).astype(np.float16))
         made += 1
     print(f"{made} references denoised")
 

@@ -40,11 +40,11 @@ from research.training.ops import box_downsample
 from research.training.splat import apply, draw_filter, filter_reference
 
 #: A batch by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w), all encoded, in
-#: channels-last memory. Some networks read further channels of the first two.
+#: channels-last memory. Some networks read further channels of the LRHS.
 Batch = dict[str, Tensor]
 
-#: Adds the further input channels of a network to an encoded pair, (h, w, 3) and (s*h, s*w, 16).
-Prepare = Callable[[Array, Array], tuple[Array, Array]]
+#: Adds the further input channels of a network to an encoded LRHS (1, 3, h, w), given the HRLS (1, 16, s*h, s*w).
+Prepare = Callable[[Tensor, Tensor], Tensor]
 
 
 CPU = torch.device("cpu")
@@ -291,7 +291,7 @@ def draw(
     """Draw a batch of ``count`` pairs of ``patch`` x ``patch`` HRLS pixels.
 
     Views, crops, spp, pixel filter, light, exposure and missing features differ within a batch. Mirroring and rotation
-    are those of the batch. ``prepare`` appends further channels to the renders' own.
+    are those of the batch. ``prepare`` appends further channels to the LRHS.
     """
     # Views and crops
     chosen = [views[i] for i in rng.choice(len(views), count)]
@@ -337,8 +337,8 @@ def draw(
     crops = [pair.lrhs[area] for pair, area in zip(renders, low_areas, strict=True)]
     lrhs = compress(torch.stack(crops), exposure)
     if prepare is not None:
-        prepared = [prepare(*images) for images in zip(lrhs.cpu().numpy(), hrls.cpu().numpy(), strict=True)]
-        lrhs, hrls = (on_device(np.stack(images)) for images in zip(*prepared, strict=True))
+        pairs = zip(lrhs.movedim(-1, 1).split(1), hrls.movedim(-1, 1).split(1), strict=True)
+        lrhs = torch.cat([prepare(*pair) for pair in pairs]).movedim(1, -1)
     pair = {"lrhs": lrhs, "hrls": hrls, "target": compress(target, exposure)}
     return {
         name: torch.rot90(image.flip(2) if mirrored else image, turns, (1, 2)).contiguous().permute(0, 3, 1, 2)

@@ -14,7 +14,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from oiio_msspl.image.arrays import Array
 from research.training import oidn
 from research.training.encoding import from_srgb, log_to_pu, pu_to_log, srgb
 from research.training.ops import box_downsample, log2_scale
@@ -49,6 +48,13 @@ class MeanDenoiser(oidn.FineTunedUNet):
         return pu_to_log(colour.clamp_max(1.0))
 
 
+def mean_images(lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return what :class:`MeanDenoiser` reads, given the arguments of :func:`denoise_mean`."""
+    _, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)
+    scale = 2 ** log2_scale(lrhs, hrls)
+    return mean, noise, box_downsample(hrls[:, 3:6].clamp(0, 1), scale), box_downsample(hrls[:, 6:9], scale)
+
+
 def denoise_mean(denoiser: MeanDenoiser, lrhs: Tensor, hrls: Tensor) -> Tensor:
     """Replace a mean of both renders by the denoised one.
 
@@ -60,19 +66,15 @@ def denoise_mean(denoiser: MeanDenoiser, lrhs: Tensor, hrls: Tensor) -> Tensor:
     Returns:
         (N, 6, h, w), log-encoded: the LRHS and the denoised mean.
     """
-    low, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)
-    scale = 2 ** log2_scale(lrhs, hrls)
-    albedo, normal = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
-    return torch.cat([low, denoiser(mean, noise, albedo, normal)], dim=1)
+    return torch.cat([lrhs[:, :LRHS_CHANNELS], denoiser(*mean_images(lrhs, hrls))], dim=1)
 
 
-def with_denoised_mean(denoiser: MeanDenoiser) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """Return a function that appends the denoised mean of both renders to an encoded LRHS (h, w, 3), given an HRLS."""
+def with_denoised_mean(denoiser: MeanDenoiser) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return a function that appends the denoised mean of both renders to an encoded LRHS, given an HRLS."""
 
-    @torch.inference_mode()
-    def prepare(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
-        low, high = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in with_mean(lrhs, hrls))
-        return denoise_mean(denoiser, low, high)[0].permute(1, 2, 0).numpy(), hrls
+    @torch.no_grad()
+    def prepare(lrhs: Tensor, hrls: Tensor) -> Tensor:
+        return denoise_mean(denoiser, with_mean(lrhs, hrls), hrls)
 
     return prepare
 

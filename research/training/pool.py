@@ -40,7 +40,7 @@ from research.training.denoisers import LayerDenoisers, denoise_mean
 from research.training.encoding import compress, exposure_of, log_decode, log_encode, log_to_pu, pu_to_log
 from research.training.joint import HRLS_CHANNELS, JointFusion
 from research.training.oidn import LARGE, LARGE_HDR, FineTunedUNet
-from research.training.render_mean import mean_and_noise
+from research.training.render_mean import with_mean
 
 log = logging.getLogger(__name__)
 
@@ -172,7 +172,7 @@ def draw_pairs(
         sampling = Sampling(spread_noise=spread if prepares else None, uneven=UNEVEN)
         batch = draw([tensors], int(rng.choice(scales)), patch, 1, rng, sampling)
         lrhs, hrls = batch["lrhs"], batch["hrls"]
-        lrhs, hrls = torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), hrls[:, :HRLS_CHANNELS]
+        lrhs, hrls = with_mean(lrhs, hrls), hrls[:, :HRLS_CHANNELS]
         target, rendered = batch["target"], hrls
         if denoisers is not None and prepares:
             lrhs, hrls = denoisers.prepared(lrhs, hrls, spread)

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.image.arrays import Array
 from oiio_msspl.model.render_mean import lrhs_share
 from research.training.encoding import log_decode, log_encode
 from research.training.ops import box_downsample, log2_scale
@@ -50,21 +49,14 @@ def mean_of_renders(lrhs: Images, hrls: Images, shares: Images) -> tuple[Tensor,
     return colour, noise, means[ALBEDO], means[NORMAL]
 
 
-def mean_and_noise(lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
-    """Average an encoded LRHS (1, 3, h, w) and HRLS (1, 16, s*h, s*w).
+def with_mean(lrhs: Tensor, hrls: Tensor) -> Tensor:
+    """Append the mean of both renders and its noise to an encoded LRHS: (1, 3, h, w) to (1, 7, h, w).
 
-    Returns:
-        The mean (1, 3, h, w), log-encoded, and its noise (1, 1, h, w).
+    The HRLS is (1, 9 or more, s*h, s*w).
     """
     features = {RGB: log_decode(hrls[:, :3]), ALBEDO: hrls[:, 3:6], NORMAL: hrls[:, 6:9]}
     means = log_encode(box_downsample(features[RGB], 2 ** log2_scale(lrhs, hrls)))
     low, high = (image[0].permute(1, 2, 0).cpu().numpy() for image in (lrhs, means))
     share = torch.tensor(lrhs_share(low, high), device=lrhs.device)
     colour, noise, *_ = mean_of_renders({RGB: log_decode(lrhs)}, features, {RGB: share})
-    return colour, noise
-
-
-def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
-    """Append the mean of both renders and its noise to an encoded LRHS (h, w, 3), given an HRLS (s*h, s*w, 16)."""
-    low, high = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (lrhs, hrls))
-    return torch.cat([low, *mean_and_noise(low, high)], dim=1)[0].permute(1, 2, 0).numpy(), hrls
+    return torch.cat([lrhs, colour, noise], dim=1)

@@ -129,7 +129,7 @@ class Run:
         self.folder = Folder(args.data)
         if not self.train_views():
             raise SystemExit(f"{args.data}: no training views (*.npz with split 'train'); render some first")
-        self.validation: dict[tuple[Path, int], ValidationPair] = {}
+        self.validation: list[ValidationPair] = []
 
         # Network: from the last checkpoint, from another run, or new
         self.network = new_network(args)
@@ -257,12 +257,11 @@ class Run:
         if self.large:
             return {}
         if not self.validation:  # views that are added later would make scores incomparable
-            prepare = preparation(self.args.network)
+            patch, prepare = self.args.val_patch, preparation(self.args.network)
             for view in self.folder.split("validation")[: self.args.val_views]:
-                for scale in self.scales:
-                    pair = ValidationPair.centre(view, scale, self.args.val_patch, prepare)
-                    self.validation[view.path, scale] = pair
-        return evaluate(cast(Network, self.average.module), self.validation.values(), self.device)
+                for scale in dict.fromkeys(self.scales):
+                    self.validation.append(ValidationPair.centre(view, scale, patch, prepare))
+        return evaluate(cast(Network, self.average.module), self.validation, self.device)
 
     def train_views(self) -> list[View | SampleView]:
         """Return the training views that there are so far, of both kinds."""

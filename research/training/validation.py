@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from research.datagen.views import Array, View, as_float32, mean_lrhs, read_hrls, split_features
 from research.training.checkpoints import Network, run
-from research.training.data import Prepare, to_tensor
+from research.training.data import CPU, Prepare, to_tensor
 from research.training.encoding import packed
 
 
@@ -22,10 +23,10 @@ from research.training.encoding import packed
 class ValidationPair:
     """The middle of a view with 1 spp in the HRLS and s^2 spp in the LRHS, the paper's (s^2 - 1)."""
 
-    lrhs: Array
-    """(h, w, 3), encoded, and the channels that :func:`research.training.checkpoints.preparation` adds."""
-    hrls: Array
-    """(s*h, s*w, 16), encoded, and the channels that are added. One sample has no variance, so that is missing."""
+    lrhs: Tensor
+    """(1, 3, h, w), encoded, and the channels that :func:`research.training.checkpoints.preparation` adds."""
+    hrls: Tensor
+    """(1, 16, s*h, s*w), encoded. One sample has no variance, so that is missing."""
     reference: Array
     """(s*h, s*w, 3), scene-linear."""
     exposure: float
@@ -38,12 +39,12 @@ class ValidationPair:
         rows, columns = slice(top, top + patch), slice(left, left + patch)
         lrhs = mean_lrhs(view, [0], scale)
         exposure = find_exposure(lrhs)
-        hrls = packed(split_features(read_hrls(view, [0], rows, columns)[0]), exposure)
         lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
-        lrhs = encode_radiance(lrhs, exposure)
+        low = to_tensor(encode_radiance(lrhs, exposure)[None], CPU)
+        high = to_tensor(packed(split_features(read_hrls(view, [0], rows, columns)[0]), exposure)[None], CPU)
         if prepare is not None:
-            lrhs, hrls = prepare(lrhs, hrls)
-        return cls(lrhs, hrls, as_float32(view.ref[rows, columns]), exposure)
+            low = prepare(low, high)
+        return cls(low, high, as_float32(view.ref[rows, columns]), exposure)
 
 
 @torch.inference_mode()
@@ -54,10 +55,10 @@ def evaluate(network: Network, pairs: Iterable[ValidationPair], device: torch.de
     """
     scores: dict[str, list[float]] = collections.defaultdict(list)
     for pair in pairs:
-        fused, _ = run(network, to_tensor(pair.lrhs[None], device), to_tensor(pair.hrls[None], device))
+        fused, _ = run(network, pair.lrhs.to(device), pair.hrls.to(device))
         output = decode_radiance(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure) * pair.exposure
         reference = pair.reference * pair.exposure
-        for name in ("psnr", f"psnr_x{pair.hrls.shape[0] // pair.lrhs.shape[0]}"):
+        for name in ("psnr", f"psnr_x{pair.hrls.shape[-1] // pair.lrhs.shape[-1]}"):
             scores[name].append(psnr(output, reference))
         scores["relmse"].append(relmse(output, reference))
     return {name: float(np.mean(values)) for name, values in scores.items()}

@@ -25,8 +25,8 @@ from oiio_msspl.model.runtime import load_network
 from research.training import CHECKPOINTS
 from research.training.checkpoints import load_joint
 from research.training.data import Batches
+from research.training.denoisers import mean_images
 from research.training.oidn import provenance
-from research.training.ops import box_downsample
 from research.training.quantise.codes import OUTPUT_SLICES, denoiser_codes, log_encoded_of_code
 from research.training.quantise.gptq import quantise_mean_denoiser
 from research.training.quantise.graph import Graph
@@ -39,12 +39,9 @@ IMAGES, PATCH = 96, 256
 
 
 def means(views: Path, split: str) -> Iterator[tuple[Tensor, ...]]:
-    """Yield colour, noise, albedo and normal of both renders' mean, from views as training draws them."""
+    """Yield the inputs of the denoiser of both renders' mean, from views as training draws them."""
     for batch in Batches(views, SCALES, PATCH, 1, with_mean, split=split):
-        lrhs, hrls = batch["lrhs"], batch["hrls"]
-        scale = hrls.shape[-1] // lrhs.shape[-1]
-        aovs = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
-        yield lrhs[:, 3:6], lrhs[:, 6:7], *aovs
+        yield mean_images(batch["lrhs"], batch["hrls"])
 
 
 def main() -> None:

@@ -42,8 +42,9 @@ def pairs(scale, prepare, count=2, size=64):
         values = [encode_radiance(noisy(clean, 4, seed + i), 1.0) for i in range(2)]
         normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
         hrls = np.concatenate([values[0], clean.clip(0, 1), normal], axis=-1)
-        images = prepare(box_downsample(values[1], scale), hrls)
-        result.append(tuple(torch.from_numpy(np.ascontiguousarray(i.transpose(2, 0, 1)[None])) for i in images))
+        images = box_downsample(values[1], scale), hrls
+        low, high = (torch.from_numpy(np.ascontiguousarray(i.transpose(2, 0, 1)[None])) for i in images)
+        result.append((prepare(low, high), high))
     return result
 
 

@@ -56,7 +56,6 @@ NOT_RUN = {
     "python -m research.training": "needs rendered views and hours",
     "python -m research.datagen": "renders for hours",
     "python -m research.benchmarks": "needs rendered scenes and an hour",
-    "python research/datagen/": "needs a renderer",
 }
 #: An option and its value -> the same.
 NOT_RUN_WITH = {"--scheduler": "needs a running Dask scheduler", "--device cuda": "needs a GPU"}
@@ -174,8 +173,6 @@ def test_commands_that_are_not_run_are_accepted(
         check_arguments(words[2], words[3:], monkeypatch)
     elif words[0] == "python" and words[1].endswith("build_zip.py"):
         assert (ROOT / words[1]).is_file()
-    elif words[0] == "python":
-        check_arguments(words[1], words[2:], monkeypatch)
     elif words[0] == "deadline":
         assert any(f"--bundle {words[-1]}" in line for line in block.commands), f"no command above writes {words[-1]}"
     else:  # the options are checked before the help is printed
@@ -200,7 +197,7 @@ class Accepted(Exception):
 
 
 def check_arguments(program: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The argparse parser of a module, or of a script by its path, takes these arguments. Nothing runs after it."""
+    """The argparse parser of a module takes these arguments. Nothing runs after it."""
     parse_args = argparse.ArgumentParser.parse_args
 
     def parse_only(*args: object, **kwargs: object) -> None:
@@ -212,10 +209,7 @@ def check_arguments(program: str, arguments: list[str], monkeypatch: pytest.Monk
     for renderer in ("bpy", "bmesh", "mathutils"):  # imported before the arguments are read
         monkeypatch.setitem(sys.modules, renderer, MagicMock(**{"app.version": (5, 0, 0)}))
     with pytest.raises(Accepted):
-        if not program.endswith(".py"):
-            runpy.run_module(program, run_name="__main__", alter_sys=True)
-        else:
-            runpy.run_path(str(ROOT / program), run_name="__main__")
+        runpy.run_module(program, run_name="__main__", alter_sys=True)
 
 
 IN_TEXT = [

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Render a low-resolution-high-spp / high-resolution-low-spp pair of one frame with Cycles.
 
-The scene is built in code from a seed.  Writes hr.exr, lr.exr and (with --ref-spp) ref.exr as
-multilayer EXR into --out.  Works with bpy 4.5 and bpy 5.0; research/datagen/README.md has the commands.
+    python -m research.datagen.cycles.pair --out PAIR
+
+The scene is built in code from a seed. PAIR gets hr.exr, lr.exr and, with --ref-spp, ref.exr, as multi-layer EXRs.
 """
 
 from __future__ import annotations
@@ -12,147 +13,113 @@ import math
 import random
 import time
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import bpy
 from mathutils import Vector
 
-Material: TypeAlias = bpy.types.Material
-Colour = tuple[float, float, float, float]
+from . import materials as mat
+from .materials import Graph, Material, Socket, rgba
+from .render import LIGHT_PASSES, set_up
+
 Point = tuple[float, float, float]
 
 
-# ---------------------------------------------------------------- materials
-def new_material(name: str, **inputs: Any) -> tuple[Material, Any, Any]:
-    """Make a Principled material; keyword `Base_Color` sets the input `Base Color`."""
-    mat = bpy.data.materials.new(name)
-    mat.use_nodes = True
-    bsdf = next(n for n in mat.node_tree.nodes if n.type == "BSDF_PRINCIPLED")
-    for key, value in inputs.items():
-        bsdf.inputs[key.replace("_", " ")].default_value = value
-    return mat, mat.node_tree, bsdf
+# Materials; colours are linear RGB
 
 
-def rgb(r: float, g: float, b: float) -> Colour:
-    return (r, g, b, 1.0)
+def principled(graph: Graph, **inputs: Any) -> Material:
+    """Finish with a Principled shader; keyword `Base_Color` sets or links the input `Base Color`."""
+    named = {key.replace("_", " "): value for key, value in inputs.items()}
+    return graph.surface(graph.add("ShaderNodeBsdfPrincipled", named))
 
 
-def node(nt: Any, kind: str, **inputs: Any) -> Any:
-    n = nt.nodes.new(kind)
-    for key, value in inputs.items():
-        n.inputs[key.replace("_", " ")].default_value = value
-    return n
+def plain(name: str, color: Point, roughness: float, **inputs: float) -> Material:
+    return principled(mat.new(name), Base_Color=color, Roughness=roughness, **inputs)
 
 
-def object_coords(nt: Any, scale: Point = (1, 1, 1), rotation: Point = (0, 0, 0)) -> Any:
-    coords = nt.nodes.new("ShaderNodeTexCoord")
-    mapping = node(nt, "ShaderNodeMapping", Scale=scale, Rotation=rotation)
-    nt.links.new(coords.outputs["Object"], mapping.inputs["Vector"])
-    return mapping.outputs["Vector"]
+def place(graph: Graph, scale: Point = (1, 1, 1), turn: float = 0, at: Point = (0, 0, 0)) -> Socket:
+    """Return positions in an object, scaled, turned around z by `turn` degrees, and shifted."""
+    coords = graph.add("ShaderNodeTexCoord").outputs["Object"]
+    inputs = {"Vector": coords, "Scale": scale, "Rotation": (0, 0, math.radians(turn)), "Location": at}
+    return graph.add("ShaderNodeMapping", inputs).outputs[0]
 
 
-def mix_colors(nt: Any, factor: Any, a: Any, b: Any, blend: str = "MIX") -> Any:
-    """Mix two colours; each argument is a socket or a constant."""
-    n = nt.nodes.new("ShaderNodeMix")
-    n.data_type, n.blend_type = "RGBA", blend
-    sockets = [s for s in n.inputs if s.type == "RGBA"]
-    fac = next(s for s in n.inputs if s.identifier == "Factor_Float")
-    for socket, value in ((fac, factor), (sockets[0], a), (sockets[1], b)):
-        if isinstance(value, bpy.types.NodeSocket):
-            nt.links.new(value, socket)
-        else:
-            socket.default_value = value
-    return next(s for s in n.outputs if s.type == "RGBA")
-
-
-def ramp(nt: Any, factor: Any, low: tuple[float, Colour], high: tuple[float, Colour]) -> Any:
+def ramp(graph: Graph, factor: Socket, low: tuple[float, Point], high: tuple[float, Point]) -> Socket:
     """Map a factor to a colour between two, each at a value of the factor."""
-    n = nt.nodes.new("ShaderNodeValToRGB")
-    for element, (position, color) in zip(n.color_ramp.elements, (low, high), strict=True):
-        element.position, element.color = position, color
-    nt.links.new(factor, n.inputs[0])
-    return n.outputs["Color"]
+    node = graph.add("ShaderNodeValToRGB", {0: factor})
+    for element, (position, color) in zip(node.color_ramp.elements, (low, high), strict=True):
+        element.position, element.color = position, rgba(color)
+    return node.outputs["Color"]
 
 
-def stripes(nt: Any, vector: Any, scale: float, direction: str) -> Any:
-    wave = node(nt, "ShaderNodeTexWave", Scale=scale, Distortion=0.0)
-    wave.bands_direction = direction
-    nt.links.new(vector, wave.inputs["Vector"])
-    return wave.outputs["Fac" if "Fac" in wave.outputs else 1]
+def stripes(graph: Graph, vector: Socket, scale: float, direction: str) -> Socket:
+    inputs = {"Vector": vector, "Scale": scale, "Distortion": 0}
+    return graph.add("ShaderNodeTexWave", inputs, bands_direction=direction).outputs["Fac"]
 
 
 def wood_floor() -> Material:
-    mat, nt, bsdf = new_material("Wood Floor", Roughness=0.32)
-    planks = node(
-        nt, "ShaderNodeTexBrick", Color1=rgb(0.46, 0.25, 0.11), Color2=rgb(0.27, 0.13, 0.055),
-        Mortar=rgb(0.03, 0.015, 0.008), Scale=1.0, Mortar_Size=0.005, Brick_Width=1.3, Row_Height=0.17,
-    )  # fmt: skip
-    nt.links.new(object_coords(nt, rotation=(0, 0, math.radians(90))), planks.inputs["Vector"])
-    grain = node(nt, "ShaderNodeTexNoise", Scale=3.0, Detail=8.0, Roughness=0.65)
-    nt.links.new(object_coords(nt, scale=(22, 1.6, 1)), grain.inputs["Vector"])
-    out = mix_colors(nt, 0.55, planks.outputs["Color"], grain.outputs[0], "OVERLAY")
-    nt.links.new(out, bsdf.inputs["Base Color"])
-    return mat
+    graph = mat.new("Wood Floor")
+    planks = graph.add("ShaderNodeTexBrick", {
+        "Vector": place(graph, turn=90), "Color1": (0.46, 0.25, 0.11), "Color2": (0.27, 0.13, 0.055),
+        "Mortar": (0.03, 0.015, 0.008), "Scale": 1, "Mortar Size": 0.005, "Brick Width": 1.3, "Row Height": 0.17,
+    })  # fmt: skip
+    inputs = {"Vector": place(graph, scale=(22, 1.6, 1)), "Scale": 3, "Detail": 8, "Roughness": 0.65}
+    grain = graph.add("ShaderNodeTexNoise", inputs).outputs[0]
+    return principled(graph, Base_Color=graph.mix(0.55, planks.outputs["Color"], grain, "OVERLAY"), Roughness=0.32)
 
 
 def wallpaper() -> Material:
-    mat, nt, bsdf = new_material("Wallpaper", Roughness=0.8)
-    factor = stripes(nt, object_coords(nt), 2.1, "X")
-    colour = ramp(nt, factor, (0.47, rgb(0.33, 0.45, 0.42)), (0.53, rgb(0.42, 0.54, 0.49)))
-    nt.links.new(colour, bsdf.inputs["Base Color"])
-    return mat
+    graph = mat.new("Wallpaper")
+    factor = stripes(graph, place(graph), 2.1, "X")
+    return principled(
+        graph, Base_Color=ramp(graph, factor, (0.47, (0.33, 0.45, 0.42)), (0.53, (0.42, 0.54, 0.49))), Roughness=0.8
+    )
 
 
-def checker(name: str, a: Colour, b: Colour, scale: float, **inputs: Any) -> Material:
-    mat, nt, bsdf = new_material(name, **inputs)
-    tex = node(nt, "ShaderNodeTexChecker", Scale=scale, Color1=a, Color2=b)
+def checker(name: str, a: Point, b: Point, scale: float, roughness: float) -> Material:
+    graph = mat.new(name)
     # a turn and an offset keep faces away from the boundaries of the 3-D pattern
-    vector = object_coords(nt, rotation=(0, 0, math.radians(3)))
-    vector.node.inputs["Location"].default_value = (0.013, 0.017, 0.021)
-    nt.links.new(vector, tex.inputs["Vector"])
-    nt.links.new(tex.outputs["Color"], bsdf.inputs["Base Color"])
-    return mat
+    vector = place(graph, turn=3, at=(0.013, 0.017, 0.021))
+    squares = graph.add("ShaderNodeTexChecker", {"Vector": vector, "Scale": scale, "Color1": a, "Color2": b})
+    return principled(graph, Base_Color=squares, Roughness=roughness)
 
 
 def tablecloth() -> Material:
     """Make a matte plaid from two crossed wave textures."""
-    mat, nt, bsdf = new_material("Cloth", Roughness=0.9, Sheen_Weight=0.4)
-    color, flat = rgb(0.76, 0.71, 0.62), nt.nodes.new("ShaderNodeTexCoord").outputs["UV"]
-    for direction, tint in (("X", rgb(0.55, 0.06, 0.05)), ("Y", rgb(0.10, 0.14, 0.34))):
-        factor = stripes(nt, flat, 3.4, direction)
-        color = mix_colors(nt, ramp(nt, factor, (0.62, rgb(0, 0, 0)), (0.70, rgb(0.8, 0.8, 0.8))), color, tint)
-    nt.links.new(color, bsdf.inputs["Base Color"])
-    return mat
+    graph = mat.new("Cloth")
+    color: Any = (0.76, 0.71, 0.62)
+    flat = graph.add("ShaderNodeTexCoord").outputs["UV"]
+    for direction, tint in (("X", (0.55, 0.06, 0.05)), ("Y", (0.10, 0.14, 0.34))):
+        share = ramp(graph, stripes(graph, flat, 3.4, direction), (0.62, (0, 0, 0)), (0.70, (0.8, 0.8, 0.8)))
+        color = graph.mix(share, color, tint)
+    return principled(graph, Base_Color=color, Roughness=0.9, Sheen_Weight=0.4)
 
 
 def painting() -> Material:
-    mat, nt, bsdf = new_material("Painting", Roughness=0.5)
-    tex = node(nt, "ShaderNodeTexVoronoi", Scale=13.0)
-    nt.links.new(object_coords(nt), tex.inputs["Vector"])
-    warm = mix_colors(nt, 0.55, tex.outputs["Color"], rgb(0.95, 0.45, 0.12), "OVERLAY")
-    nt.links.new(warm, bsdf.inputs["Base Color"])
-    return mat
+    graph = mat.new("Painting")
+    cells = graph.add("ShaderNodeTexVoronoi", {"Vector": place(graph), "Scale": 13}).outputs["Color"]
+    return principled(graph, Base_Color=graph.mix(0.55, cells, (0.95, 0.45, 0.12), "OVERLAY"), Roughness=0.5)
+
+
+def grass_blade() -> Material:
+    graph = mat.new("Grass")
+    tone = graph.add("ShaderNodeTexNoise", {"Scale": 9, "Detail": 2}).outputs[0]
+    return principled(graph, Base_Color=graph.mix(tone, (0.05, 0.20, 0.03), (0.42, 0.50, 0.10)), Roughness=0.5)
 
 
 def glass() -> Material:
     """Glass whose shadow is clear, so that path tracing it stays quiet."""
-    mat = bpy.data.materials.new("Glass")
-    mat.use_nodes = True
-    nt = mat.node_tree
-    nt.nodes.clear()
-    out = nt.nodes.new("ShaderNodeOutputMaterial")
-    bsdf = node(nt, "ShaderNodeBsdfGlass", Color=rgb(0.95, 0.985, 0.97), Roughness=0.0, IOR=1.45)
-    path = nt.nodes.new("ShaderNodeLightPath")
-    clear = node(nt, "ShaderNodeBsdfTransparent", Color=rgb(0.86, 0.90, 0.88))
-    mix = nt.nodes.new("ShaderNodeMixShader")
-    nt.links.new(path.outputs["Is Shadow Ray"], mix.inputs[0])
-    nt.links.new(bsdf.outputs[0], mix.inputs[1])
-    nt.links.new(clear.outputs[0], mix.inputs[2])
-    nt.links.new(mix.outputs[0], out.inputs["Surface"])
-    return mat
+    graph = mat.new("Glass")
+    bsdf = graph.add("ShaderNodeBsdfGlass", {"Color": (0.95, 0.985, 0.97), "Roughness": 0, "IOR": 1.45})
+    shadow = graph.add("ShaderNodeLightPath").outputs["Is Shadow Ray"]
+    clear = graph.add("ShaderNodeBsdfTransparent", {"Color": (0.86, 0.90, 0.88)})
+    return graph.surface(graph.add("ShaderNodeMixShader", {0: shadow, 1: bsdf, 2: clear}))
 
 
-# ----------------------------------------------------------------- geometry
+# Geometry
+
+
 def finish(ob: Any, mat: Material, smooth: bool = False) -> Any:
     """Give an object its material and smoothness."""
     ob.data.materials.append(mat)
@@ -240,18 +207,22 @@ def grass(name: str, rng: random.Random, mat: Material, at: Point, radius: float
     return mesh_object(name, verts, faces, mat, at=at)
 
 
-def sphere(name: str, radius: float, mat: Material, at: Point, segments: int = 64) -> Any:
-    bpy.ops.mesh.primitive_uv_sphere_add(segments=segments, ring_count=segments // 2, radius=radius, location=at)
+def primitive(kind: str, name: str, mat: Material, smooth: bool = False, **where: Any) -> Any:
+    """Add a mesh that Blender has built in."""
+    getattr(bpy.ops.mesh, f"primitive_{kind}_add")(**where)
     ob = bpy.context.object
     ob.name = name
-    return finish(ob, mat, smooth=True)
+    return finish(ob, mat, smooth)
+
+
+def sphere(name: str, radius: float, mat: Material, at: Point, segments: int = 64) -> Any:
+    rings = segments // 2
+    return primitive("uv_sphere", name, mat, True, segments=segments, ring_count=rings, radius=radius, location=at)
 
 
 def cone(name: str, r1: float, r2: float, depth: float, mat: Material, at: Point, cap: str = "NGON") -> Any:
-    bpy.ops.mesh.primitive_cone_add(vertices=64, radius1=r1, radius2=r2, depth=depth, location=at, end_fill_type=cap)
-    ob = bpy.context.object
-    ob.name = name
-    return finish(ob, mat)
+    shape = {"vertices": 64, "radius1": r1, "radius2": r2, "depth": depth, "end_fill_type": cap}
+    return primitive("cone", name, mat, location=at, **shape)
 
 
 def label(text: str, size: float, mat: Material, at: Point) -> Any:
@@ -263,15 +234,17 @@ def label(text: str, size: float, mat: Material, at: Point) -> Any:
     return finish(ob, mat)
 
 
-# -------------------------------------------------------------------- scene
+# The scene
+
+
 def build_scene(seed: int) -> Any:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     rng = random.Random(seed)
     scene = bpy.context.scene
-    white = new_material("Paint", Base_Color=rgb(0.80, 0.79, 0.76), Roughness=0.45)[0]
-    dark = new_material("Dark Metal", Base_Color=rgb(0.05, 0.05, 0.055), Metallic=1.0, Roughness=0.35)[0]
-    plaster = new_material("Plaster", Base_Color=rgb(0.47, 0.55, 0.51), Roughness=0.8)[0]
-    oak = new_material("Oak", Base_Color=rgb(0.34, 0.19, 0.09), Roughness=0.4)[0]
+    white = plain("Paint", (0.80, 0.79, 0.76), 0.45)
+    dark = plain("Dark Metal", (0.05, 0.05, 0.055), 0.35, Metallic=1)
+    plaster = plain("Plaster", (0.47, 0.55, 0.51), 0.8)
+    oak = plain("Oak", (0.34, 0.19, 0.09), 0.4)
 
     # shell: floor, back wall, a left wall with a barred window
     box("Floor", (-4, -5, -0.1), (4, 2.2, 0), wood_floor())
@@ -294,48 +267,39 @@ def build_scene(seed: int) -> Any:
     box("Sill", (x0, ya - 0.05, za - 0.04), (x1 + 0.14, yb + 0.05, za), white)
 
     # rug, pedestal with the head, table with cloth and glass ball
-    rug = checker("Rug", rgb(0.60, 0.52, 0.40), rgb(0.13, 0.035, 0.04), 11.0, Roughness=0.95)
+    rug = checker("Rug", (0.60, 0.52, 0.40), (0.13, 0.035, 0.04), 11.0, 0.95)
     box("Rug", (-1.45, -0.95, 0), (0.55, 0.30, 0.012), rug)
-    marquetry = checker("Marquetry", rgb(0.36, 0.20, 0.09), rgb(0.13, 0.06, 0.03), 9.0, Roughness=0.25)
+    marquetry = checker("Marquetry", (0.36, 0.20, 0.09), (0.13, 0.06, 0.03), 9.0, 0.25)
     box("Pedestal", (-1.02, 0.62, 0), (-0.28, 1.30, 0.62), marquetry)
-    gold = new_material("Gold", Base_Color=rgb(0.95, 0.56, 0.20), Metallic=1.0, Roughness=0.16)[0]
-    bpy.ops.mesh.primitive_monkey_add(size=0.92, location=(-0.65, 0.93, 1.03))
-    head = bpy.context.object
-    head.name = "Suzanne"
+    gold = plain("Gold", (0.95, 0.56, 0.20), 0.16, Metallic=1)
+    head = primitive("monkey", "Suzanne", gold, True, size=0.92, location=(-0.65, 0.93, 1.03))
     head.rotation_euler = (math.radians(-14), 0, math.radians(16))
     head.modifiers.new("Subdivision", "SUBSURF").render_levels = 2
-    finish(head, gold, smooth=True)
 
     table = (0.74, 0.62, 0.74)
     cone("Table Leg", 0.20, 0.05, 0.72, oak, (table[0], table[1], 0.36))
     cloth("Tablecloth", tablecloth(), table)
     sphere("Glass Ball", 0.22, glass(), (table[0] - 0.12, table[1] - 0.14, table[2] + 0.22))
-    china = new_material("China", Base_Color=rgb(0.80, 0.82, 0.86), Roughness=0.08)[0]
+    china = plain("China", (0.80, 0.82, 0.86), 0.08)
     sphere("Pearl", 0.085, china, (table[0] + 0.26, table[1] - 0.20, table[2] + 0.085))
-    red = new_material("Red Lacquer", Base_Color=rgb(0.62, 0.03, 0.03), Roughness=0.12, Coat_Weight=1.0)[0]
+    red = plain("Red Lacquer", (0.62, 0.03, 0.03), 0.12, Coat_Weight=1)
     sphere("Cherry", 0.055, red, (table[0] + 0.10, table[1] - 0.37, table[2] + 0.055))
 
     # pot with grass, wire globe
-    pot = new_material("Terracotta", Base_Color=rgb(0.52, 0.19, 0.09), Roughness=0.8)[0]
+    pot = plain("Terracotta", (0.52, 0.19, 0.09), 0.8)
     cone("Pot", 0.13, 0.19, 0.30, pot, (1.62, 0.16, 0.15))
-    blade, nt, bsdf = new_material("Grass", Base_Color=rgb(0.13, 0.36, 0.05), Roughness=0.5)
-    tone = node(nt, "ShaderNodeTexNoise", Scale=9.0, Detail=2.0)
-    green = mix_colors(nt, tone.outputs[0], rgb(0.05, 0.20, 0.03), rgb(0.42, 0.50, 0.10))
-    nt.links.new(green, bsdf.inputs["Base Color"])
-    grass("Grass", rng, blade, (1.62, 0.16, 0.29), radius=0.16, height=0.60)
-    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=3, radius=0.23, location=(-0.98, -0.30, 0.24))
-    globe = bpy.context.object
-    globe.name, globe.rotation_euler = "Wire Globe", (0.05, 0.0, 0.25)
-    wires = globe.modifiers.new("Wireframe", "WIREFRAME")
-    wires.thickness = 0.010
-    finish(globe, new_material("Steel", Base_Color=rgb(0.75, 0.77, 0.80), Metallic=1.0, Roughness=0.2)[0])
+    grass("Grass", rng, grass_blade(), (1.62, 0.16, 0.29), radius=0.16, height=0.60)
+    steel = plain("Steel", (0.75, 0.77, 0.80), 0.2, Metallic=1)
+    globe = primitive("ico_sphere", "Wire Globe", steel, subdivisions=3, radius=0.23, location=(-0.98, -0.30, 0.24))
+    globe.rotation_euler = (0.05, 0.0, 0.25)
+    globe.modifiers.new("Wireframe", "WIREFRAME").thickness = 0.010
 
     # pendant lamp: cable, shade, visible bulb, three stay wires
     lamp = Vector((0.10, 0.80, 1.98))
     tube("Cable", [(lamp.x, lamp.y, 3.4), (lamp.x, lamp.y, lamp.z + 0.16)], 0.006, dark)
-    shade = new_material("Shade", Base_Color=rgb(0.04, 0.20, 0.22), Roughness=0.3)[0]
+    shade = plain("Shade", (0.04, 0.20, 0.22), 0.3)
     cone("Shade", 0.26, 0.07, 0.20, shade, lamp + Vector((0, 0, 0.06)), cap="NOTHING")
-    bulb, nt, bsdf = new_material("Bulb", Emission_Color=rgb(1.0, 0.72, 0.40), Emission_Strength=38.0)
+    bulb = principled(mat.new("Bulb"), Emission_Color=(1.0, 0.72, 0.40), Emission_Strength=38)
     sphere("Bulb", 0.062, bulb, lamp - Vector((0, 0, 0.02)), segments=24)
     for k in range(3):
         a = 2 * math.pi * k / 3 + 0.4
@@ -355,9 +319,9 @@ def build_scene(seed: int) -> Any:
             (0.45, 0.08, 0.06), (0.08, 0.16, 0.34), (0.60, 0.47, 0.24),
             (0.10, 0.25, 0.14), (0.50, 0.50, 0.47), (0.62, 0.28, 0.06),
         ])  # fmt: skip
-        mat = new_material("Book", Base_Color=rgb(*hue), Roughness=rng.uniform(0.25, 0.7))[0]
-        book = box("Book", (x, 1.99 + rng.uniform(0, 0.03), 1.42), (x + w, 2.17, 1.42 + h), mat)
-        bands = new_material("Band", Base_Color=rgb(0.75, 0.60, 0.25), Metallic=1.0, Roughness=0.3)[0]
+        cover = plain("Book", hue, rng.uniform(0.25, 0.7))
+        book = box("Book", (x, 1.99 + rng.uniform(0, 0.03), 1.42), (x + w, 2.17, 1.42 + h), cover)
+        bands = plain("Band", (0.75, 0.60, 0.25), 0.3, Metallic=1)
         y = book.location.y - 0.001 - (2.17 - book.location.y)
         for f in (0.18, 0.80):
             box("Band", (x + 0.002, y, 1.42 + f * h), (x + w - 0.002, y + 0.002, 1.42 + f * h + 0.013), bands)
@@ -383,15 +347,10 @@ def build_scene(seed: int) -> Any:
 
     world = bpy.data.worlds.new("Sky")
     scene.world = world
-    world.use_nodes = True
-    nt = world.node_tree
-    back = next(n for n in nt.nodes if n.type == "BACKGROUND")
-    coords = nt.nodes.new("ShaderNodeTexCoord")
-    split = nt.nodes.new("ShaderNodeSeparateXYZ")
-    nt.links.new(coords.outputs["Generated"], split.inputs[0])
-    sky = ramp(nt, split.outputs["Z"], (0, rgb(0.90, 0.93, 0.95)), (1, rgb(0.30, 0.50, 0.95)))
-    nt.links.new(sky, back.inputs["Color"])
-    back.inputs["Strength"].default_value = 0.62
+    graph = Graph(world)
+    up = graph.add("ShaderNodeSeparateXYZ", {0: graph.add("ShaderNodeTexCoord").outputs["Generated"]}).outputs["Z"]
+    sky = ramp(graph, up, (0, (0.90, 0.93, 0.95)), (1, (0.30, 0.50, 0.95)))
+    graph.surface(graph.add("ShaderNodeBackground", {"Color": sky, "Strength": 0.62}))
     world.cycles.sampling_method = "MANUAL"
     world.cycles.sample_map_resolution = 512
 
@@ -405,35 +364,19 @@ def build_scene(seed: int) -> Any:
     return scene
 
 
-# ------------------------------------------------------------------- render
-PASSES = [
-    "z", "normal", "cryptomatte_object",
-    *(f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color")),
-]  # fmt: skip
+# The render
 
 
-def configure(scene: Any, args: argparse.Namespace) -> None:
-    scene.render.engine = "CYCLES"
-    c = scene.cycles
-    c.device = "CPU"
-    c.use_denoising = c.use_adaptive_sampling = c.use_animated_seed = False
-    c.sample_clamp_direct = c.sample_clamp_indirect = 0.0
-    c.sampling_pattern = "TABULATED_SOBOL"
-    c.pixel_filter_type = "BOX"
+def configure(scene: Any, threads: int) -> None:
+    set_up(scene, threads, "ZIP")
+    c, r, image, layer = scene.cycles, scene.render, scene.render.image_settings, scene.view_layers[0]
+    c.sampling_pattern, c.pixel_filter_type = "TABULATED_SOBOL", "BOX"
     c.caustics_reflective = c.caustics_refractive = False
     c.max_bounces, c.diffuse_bounces, c.glossy_bounces, c.transmission_bounces = 8, 4, 4, 8
-    r = scene.render
-    r.threads_mode, r.threads = "FIXED", args.threads
-    r.use_persistent_data = True
-    r.use_motion_blur = r.film_transparent = r.use_compositing = r.use_sequencer = False
-    r.resolution_percentage, r.dither_intensity = 100, 0.0
-    image = r.image_settings
-    if bpy.app.version >= (5, 0, 0):
-        image.media_type, image.use_exr_interleave = "MULTI_LAYER_IMAGE", False
-    image.file_format, image.color_depth, image.exr_codec = "OPEN_EXR_MULTILAYER", "16", "ZIP"
-    layer = scene.view_layers[0]
-    for flag in PASSES:
-        setattr(layer, f"use_pass_{flag}", True)
+    r.use_persistent_data, r.use_motion_blur = True, False
+    image.color_depth, image.use_exr_interleave = "16", False
+    for name in ("z", "normal", "cryptomatte_object", *LIGHT_PASSES):
+        setattr(layer, f"use_pass_{name}", True)
     layer.cycles.denoising_store_passes = True
     layer.pass_cryptomatte_depth = 2
 
@@ -466,7 +409,7 @@ def main() -> None:
     args = p.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     scene = build_scene(args.seed)
-    configure(scene, args)
+    configure(scene, args.threads)
     w, h = args.size
     # rounded up: an LRHS render covers all of the frame
     low = -(-w // args.scale), -(-h // args.scale)

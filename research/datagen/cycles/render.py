@@ -23,7 +23,7 @@ _ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most ren
 # reference below the second PSNR is not used. Training references may be noisy: their noise has zero mean, and many
 # scenes help more than clean ones. Validation and test references must be clean.
 _REFERENCE = {"train": (24.0, 20.0, 2), "validation": (28.0, 20.0, 4), "test": (40.0, 30.0, 12)}
-_LIGHT_PASSES = [f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color")]
+LIGHT_PASSES = [f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color")]
 
 
 def set_up(scene: bpy.types.Scene, threads: int, codec: str) -> None:
@@ -77,7 +77,7 @@ class Renderer:
     def layers(self, on: bool) -> None:
         """Switch all AOVs on, or all but the colour off."""
         layer = self._scene.view_layers[0]
-        for name in _LIGHT_PASSES:
+        for name in LIGHT_PASSES:
             setattr(layer, f"use_pass_{name}", on)
         layer.cycles.denoising_store_passes = on
 

@@ -23,14 +23,12 @@ samples a pixel are L * s^2 samples for each LRHS pixel at scale s.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from research.datagen.quality import log_mean
-from research.datagen.views import SAMPLES_SUFFIX
 
 #: Height and width of a view in pixels.
 SIZE = 384
@@ -38,11 +36,6 @@ SIZE = 384
 HR_SAMPLES, LR_SAMPLES = 12, 4
 #: The smallest step of :func:`encode`, and its largest mantissa.
 STEP, MANTISSA = 2.0**-24, 511
-
-
-def path_of(out: Path, renderer: str, seed: int, view: int) -> Path:
-    """Return the file of a scene's view."""
-    return out / f"{renderer}-{seed:06d}-{view}{SAMPLES_SUFFIX}"
 
 
 def encode(radiance: NDArray[Any]) -> NDArray[np.uint32]:

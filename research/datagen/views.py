@@ -29,6 +29,8 @@ import logging
 import mmap
 import struct
 import zipfile
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +54,8 @@ SIZE = 256
 HR_PASSES, LR_SPP = 8, (1, 1, 2, 4, 8)
 #: End of the names of views that keep single samples, and cells of their reference per pixel, along each side.
 SAMPLES_SUFFIX, REF_CELLS = ".samples.npz", 2
+#: Cameras with which a view is rendered, at most, until its reference is clean enough.
+RENDERS = 2
 #: Pixel filters that a view's ``meta`` may name.
 FILTERS = ("box", "blackman-harris")
 
@@ -72,9 +76,15 @@ def split_of(seed: int) -> str:
     return {0: "validation", 1: "test"}.get(seed % 20, "train")
 
 
-def path_of(out: Path, renderer: str, seed: int, view: int) -> Path:
-    """Return the file of a scene's view."""
-    return out / f"{renderer}-{seed:06d}-{view}.npz"
+def path_of(out: Path, renderer: str, seed: int, view: int, suffix: str = ".npz") -> Path:
+    """Return the file of a scene's view; ``suffix`` is ``SAMPLES_SUFFIX`` if it keeps single samples."""
+    return out / f"{renderer}-{seed:06d}-{view}{suffix}"
+
+
+def missing(out: Path, renderer: str, seed: int, count: int, suffix: str = ".npz") -> dict[int, Path]:
+    """Return those of a scene's first ``count`` views that have no file yet: by view, the file."""
+    files = {view: path_of(out, renderer, seed, view, suffix) for view in range(count)}
+    return {view: file for view, file in files.items() if not file.exists()}
 
 
 def lr_key(scale: int) -> str:
@@ -128,6 +138,22 @@ def save(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write a view's file; the file appears under its name only when it is complete."""
     with replacing(path, overwrite=True) as temporary:
         np.savez(temporary, **arrays)  # type: ignore[arg-type]
+
+
+def write(files: dict[int, Path], renders: Callable[[int], Iterator[dict[str, np.ndarray] | None]]) -> int:
+    """Render views and write their files; return how many were written.
+
+    Args:
+        files: by view.
+        renders: render a view with one camera after another: all arrays of its file, or None if they are of no use.
+    """
+    written = 0
+    for view, file in files.items():
+        arrays = next((arrays for arrays in islice(renders(view), RENDERS) if arrays is not None), None)
+        if arrays is not None:
+            save(file, arrays)
+            written += 1
+    return written
 
 
 # Reading

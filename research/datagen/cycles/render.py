@@ -6,7 +6,6 @@ from __future__ import annotations
 import tempfile
 import zlib
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from pathlib import Path
 
 import bpy
@@ -18,7 +17,7 @@ from research.datagen import quality, views
 
 from . import scenes
 
-_ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most rendered in full
+_ATTEMPTS = 12  # cameras that are tried for a view
 # By split: samples are added until a reference reaches the first PSNR [dB], up to the third figure times `ref_spp`. A
 # reference below the second PSNR is not used. Training references may be noisy: their noise has zero mean, and many
 # scenes help more than clean ones. Validation and test references must be clean.
@@ -201,19 +200,16 @@ def render_scene(
         filter_name: pixel filter of both renders. If None, the LRHS has a box filter, and the HRLS of every fourth
             seed a wider one.
     """
-    missing = [v for v in range(count) if not views.path_of(out, "cycles", seed, v).exists()]
+    missing = views.missing(out, "cycles", seed, count)
     if not missing:
         return 0, "done before"
     stage = scenes.build(seed)
-    written = 0
     shared = Path("/dev/shm")  # a RAM disk, on Linux
     with tempfile.TemporaryDirectory(prefix="cycles-views-", dir=shared if shared.is_dir() else None) as scratch:
         renderer = Renderer(Path(scratch), stage, threads)
-        for view in missing:
-            cameras = find_cameras(renderer, stage, seed, view)
-            renders = (render_view(renderer, stage, c, seed, view, ref_spp, filter_name) for c in cameras)
-            arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
-            if arrays is not None:
-                views.save(views.path_of(out, "cycles", seed, view), arrays)
-                written += 1
-    return written, stage.kind
+
+        def renders(view: int) -> Iterator[dict[str, np.ndarray] | None]:
+            for camera in find_cameras(renderer, stage, seed, view):
+                yield render_view(renderer, stage, camera, seed, view, ref_spp, filter_name)
+
+        return views.write(missing, renders), stage.kind

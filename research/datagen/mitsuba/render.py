@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 
 import mitsuba as mi
@@ -16,7 +15,7 @@ from . import scenes
 from .assets import Assets
 from .trace import MAX_DEPTH, Camera, render_passes
 
-_ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most rendered in full
+_ATTEMPTS = 12  # cameras that are tried for a view
 _GOOD_REFERENCE, _WORST_REFERENCE = 27.0, 21.0  # dB, of the reference's own noise
 _BATCH = 16  # samples a pixel per wavefront: bounds the memory
 
@@ -92,17 +91,13 @@ def render_view(
 
 def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int) -> tuple[int, str]:
     """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene."""
-    missing = [v for v in range(count) if not views.path_of(out, "mitsuba", seed, v).exists()]
+    missing = views.missing(out, "mitsuba", seed, count)
     if not missing:
         return 0, "done before"
     scene, plan = scenes.build(seed, assets)
-    written = 0
-    for view in missing:
-        cameras = find_cameras(scene, plan, seed, view)
-        renders = (render_view(scene, plan, c, seed, view, ref_spp) for c in cameras)
-        arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
-        if arrays is None:
-            continue
-        views.save(views.path_of(out, "mitsuba", seed, view), arrays)
-        written += 1
-    return written, plan.kind
+
+    def renders(view: int) -> Iterator[dict[str, np.ndarray] | None]:
+        for camera in find_cameras(scene, plan, seed, view):
+            yield render_view(scene, plan, camera, seed, view, ref_spp)
+
+    return views.write(missing, renders), plan.kind

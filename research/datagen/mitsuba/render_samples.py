@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from itertools import islice
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,7 +34,6 @@ if TYPE_CHECKING:  # Mitsuba's types exist only after a variant is set
     from research.datagen.mitsuba.scenes import Scene
     from research.datagen.mitsuba.trace import Camera
 
-_RENDERS = 2  # cameras that are rendered, at most, until a reference is clean enough
 _LIT = 0.3  # share of pixels that have light at 16 spp: less than for other views, because light may be rare
 _GOOD_REFERENCE, _WORST_REFERENCE = 26.0, 18.0  # dB, of the rendered reference's own noise
 _BATCH = 4  # samples a reference cell per wavefront: bounds the memory
@@ -121,7 +120,7 @@ def render_scene(args: argparse.Namespace, assets: Assets, seed: int) -> tuple[i
     from research.datagen.mitsuba import rooms, scenes
     from research.datagen.mitsuba.render import find_cameras
 
-    missing = [v for v in range(args.views) if not samples.path_of(args.out, "mitsuba", seed, v).exists()]
+    missing = views.missing(args.out, "mitsuba", seed, args.views, views.SAMPLES_SUFFIX)
     if not missing:
         return 0, "done before"
     is_room = args.rooms is not None and seed % 3 == 2
@@ -132,17 +131,12 @@ def render_scene(args: argparse.Namespace, assets: Assets, seed: int) -> tuple[i
     if not args.ref_spp and split not in ("room", "train"):
         return 0, f"for {split}"
     scene, plan = rooms.build(args.rooms, seed, assets) if is_room else scenes.build(seed, assets)
-    written = 0
-    for view in missing:
-        cameras = find_cameras(scene, plan, seed, view, _LIT)
-        renders = (
-            render_view(scene, plan, c, seed, view, split, args.ref_spp, keep_noise=args.keep_noise) for c in cameras
-        )
-        arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
-        if arrays is not None:
-            views.save(samples.path_of(args.out, "mitsuba", seed, view), arrays)
-            written += 1
-    return written, plan.kind
+
+    def renders(view: int) -> Iterator[dict[str, np.ndarray] | None]:
+        for camera in find_cameras(scene, plan, seed, view, _LIT):
+            yield render_view(scene, plan, camera, seed, view, split, args.ref_spp, keep_noise=args.keep_noise)
+
+    return views.write(missing, renders), plan.kind
 
 
 def main() -> int:

@@ -44,5 +44,5 @@ def write_wall(
         {"seed": 3, "split": split, "renderer": "none", "generator": 0},
         ref_layers,
     )
-    views.save(samples.path_of(folder, "mitsuba", 3, 0), arrays)
+    views.save(views.path_of(folder, "mitsuba", 3, 0, views.SAMPLES_SUFFIX), arrays)
     return folder

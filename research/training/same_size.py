@@ -154,9 +154,7 @@ def same_size_model(path: Path, clean: bool) -> onnx.ModelProto:
         outputs = [value for value in outputs if value.name != "log_error"]
     made = {f"encoded.{name}" for name in names}
     nodes = [n for n in model.graph.node if not n.output[0].startswith(ENTER) and n.output[0] not in made]
-    tensors = [*model.graph.initializer, *graph.embedded, *graph.constants()]
-    nodes, tensors = _needed([*graph.nodes, *nodes], tensors, [value.name for value in outputs])
-    return _finished(model, contract, outputs, nodes, tensors)
+    return _finished(model, contract, graph, nodes, outputs)
 
 
 def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:
@@ -187,18 +185,17 @@ def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:
     graph.embed(draw, "draw.", names)
     outputs = [value for value in model.graph.output if value.name != "log_error"]
     made = {name for node in graph.nodes for name in node.output}
-    nodes = [*graph.nodes, *(node for node in model.graph.node if made.isdisjoint(node.output))]
-    nodes, tensors = _needed(
-        nodes, [*model.graph.initializer, *graph.embedded, *graph.constants()], [value.name for value in outputs]
-    )
-    return _finished(model, contract, outputs, nodes, tensors)
+    nodes = [node for node in model.graph.node if made.isdisjoint(node.output)]
+    return _finished(model, contract, graph, nodes, outputs)
 
 
 def _finished(
-    model: onnx.ModelProto, contract: Contract, outputs: list[onnx.ValueInfoProto], nodes: list[onnx.NodeProto],
-    tensors: list[onnx.TensorProto],
+    model: onnx.ModelProto, contract: Contract, graph: Nodes, nodes: list[onnx.NodeProto],
+    outputs: list[onnx.ValueInfoProto],
 ) -> onnx.ModelProto:  # fmt: skip
-    """Give a model another graph and contract."""
+    """Give a model another contract, and a graph of new nodes and of some that it has: what the outputs need."""
+    tensors = [*model.graph.initializer, *graph.embedded, *graph.constants()]
+    nodes, tensors = _needed([*graph.nodes, *nodes], tensors, [value.name for value in outputs])
     model.graph.CopyFrom(helper.make_graph(nodes, contract.name, inputs_of(contract), outputs, tensors))
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     return model

@@ -126,16 +126,6 @@ def concatenated(*parts: CodeLayout) -> CodeLayout:
     return CodeLayout(torch.cat(scale), torch.cat(source))
 
 
-# The inputs of the denoiser of both renders' mean
-
-
-def denoiser_inputs(codes: Sequence[Tensor]) -> Activations:
-    """Dequantise the codes of :func:`research.training.quantise.codes.denoiser_codes`, and keep them beside."""
-    scale = [1 / INPUT_SLICES / 255] * (3 * INPUT_SLICES) + [1 / 255] * 7
-    layout = CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
-    return Activations([layout.dequantise(image[0])[None] for image in codes], list(codes), layout)
-
-
 # The fit
 
 
@@ -322,6 +312,9 @@ def quantise_mean_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tenso
         weights: in full precision.
         codes: inputs of the network, see :func:`research.training.quantise.codes.denoiser_codes`.
     """
+    scale = [1 / INPUT_SLICES / 255] * (3 * INPUT_SLICES) + [1 / 255] * 7
+    layout = CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
+    inputs = Activations([layout.dequantise(image[0])[None] for image in codes], list(codes), layout)
     fit = Fit(shape, weights)
-    run_unet_on_activations(fit.shape, [denoiser_inputs(codes)], fit.conv)
+    run_unet_on_activations(shape, [inputs], fit.conv)
     return fit

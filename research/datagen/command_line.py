@@ -33,7 +33,6 @@ def parser(module: str, description: str, ref_spp: int) -> argparse.ArgumentPars
     seeds = "first:last or first:last:step, last not included (0:400)"
     p.add_argument("--seeds", type=_seeds, default=range(0, 400), help=seeds)
     p.add_argument("--views", type=int, default=3, help="views per scene (%(default)s)")
-    p.add_argument("--minutes", type=float, default=float("inf"), help="start no new scene after this time")
     p.add_argument("--threads", type=int, default=1, help="CPU threads (%(default)s)")
     p.add_argument("--ref-spp", type=int, default=ref_spp, help="spp of a reference; noisy ones get more (%(default)s)")
     return p
@@ -48,9 +47,6 @@ def render_all(args: argparse.Namespace, render_scene: Callable[[int], tuple[int
     args.out.mkdir(parents=True, exist_ok=True)
     start, total = time.monotonic(), 0
     for seed in args.seeds:
-        if time.monotonic() - start > args.minutes * 60:
-            print("out of time")
-            break
         if shutil.disk_usage(args.out).free < MIN_FREE:
             print("disk nearly full", file=sys.stderr)
             return 1

@@ -23,33 +23,28 @@ from oiio_msspl.model.encoding import MAX_RADIANCE
 from research.datagen import views
 
 
-def denoised(view: views.View) -> views.Array:
-    """Denoise the reference of a view, (H, W, 3), scene-linear."""
+def denoised(color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Denoise a scene-linear reference (H, W, 3), guided by albedo and normal."""
     import pyoidn
 
-    whole = slice(None)
-    guides = views.split_features(np.mean(views.read_hrls(view, list(range(len(view.hr))), whole, whole), axis=0))
-    return pyoidn.denoise(
-        views.as_float32(view.ref),
-        albedo=np.ascontiguousarray(guides[ALBEDO].clip(0, 1)),
-        normal=np.ascontiguousarray(guides[NORMAL]),
-        hdr=True,
-        quality="high",
-    )
+    color, albedo, normal = (np.ascontiguousarray(image, np.float32) for image in (color, albedo.clip(0, 1), normal))
+    return pyoidn.denoise(color, albedo=albedo, normal=normal, hdr=True, quality="high")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, help="folder of views")
     args = parser.parse_args()
-    made = 0
+    made, whole = 0, slice(None)
     folder = views.Folder(args.views)
     for view in folder.split("train") + folder.split("validation"):
         path = views.denoised_reference(view.path)
         if path.exists():
             continue
+        guides = views.split_features(np.mean(views.read_hrls(view, list(range(len(view.hr))), whole, whole), axis=0))
+        clean = denoised(views.as_float32(view.ref), guides[ALBEDO], guides[NORMAL])
         with replacing(path, overwrite=True) as temporary:
-            np.save(temporary, np.minimum(denoised(view), MAX_RADIANCE).astype(np.float16))
+            np.save(temporary, np.minimum(clean, MAX_RADIANCE).astype(np.float16))
         made += 1
     print(f"{made} references denoised")
 

@@ -264,11 +264,8 @@ class Folder:
 
 def split_features(passes: Array) -> dict[str, Array]:
     """Split passes (..., 15), in the channel order of ``hr``, into named features (..., 3)."""
-    features, start = {}, 0
-    for name in PASS_FEATURES:
-        features[name] = passes[..., start : start + HRLS_FEATURES[name]]
-        start += HRLS_FEATURES[name]
-    return features
+    ends = np.cumsum([HRLS_FEATURES[name] for name in PASS_FEATURES])[:-1]
+    return dict(zip(PASS_FEATURES, np.split(passes, ends, axis=-1), strict=True))
 
 
 def as_float32(values: NDArray, *, signed: bool = False) -> Array:

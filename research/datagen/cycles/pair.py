@@ -221,7 +221,7 @@ def sphere(name: str, radius: float, mat: Material, at: Point, segments: int = 6
 
 
 def cone(name: str, r1: float, r2: float, depth: float, mat: Material, at: Point, cap: str = "NGON") -> Any:
-    shape = {"vertices": 64, "radius1": r1, "radius2": r2, "depth": depth, "end_fill_type": cap}
+    shape: dict[str, Any] = {"vertices": 64, "radius1": r1, "radius2": r2, "depth": depth, "end_fill_type": cap}
     return primitive("cone", name, mat, location=at, **shape)
 
 

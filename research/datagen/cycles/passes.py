@@ -13,7 +13,6 @@ because a reference with caustics takes too many samples. Files that exist are k
 from __future__ import annotations
 
 import argparse
-import itertools
 import tempfile
 import time
 from pathlib import Path
@@ -29,6 +28,8 @@ SIZE = (384, 216)
 #: They show metal and glass under softboxes, a room with dozens of lights, glassware, and a room with three lamps.
 VIEWS = ((11261, "BOX"), (10441, "BLACKMAN_HARRIS"), (10921, "BOX"), (10121, "BLACKMAN_HARRIS"))
 SCALES, HRLS, LRHS = (2, 4), (1, 2, 4), (1, 2)
+#: Samples per pixel of a reference.
+REFERENCE = 512
 #: Most light groups of lamps.
 GROUPS = 4
 #: The components that sum to Combined. Combined itself is always on.
@@ -60,13 +61,12 @@ def group_lights(scene: bpy.types.Scene) -> None:
         scene.world.lightgroup = groups.add(name="world").name
 
 
-def render(out: Path, seed: int, pixel_filter: str, size: tuple[int, int], reference: int, threads: int) -> None:
-    """Render the files of one seed that do not exist yet. ``reference`` is in spp; 0 for none."""
+def render(out: Path, seed: int, pixel_filter: str, threads: int) -> None:
+    """Render the files of one seed that do not exist yet."""
     folder = out / f"cycles_{seed}_{pixel_filter.lower()}"
     jobs = [(f"hr_{spp}spp", 1, spp) for spp in HRLS]
     jobs += [(f"lr_x{scale}_{scale**2 * spp}spp", scale, scale**2 * spp) for scale in SCALES for spp in LRHS]
-    jobs += [("ref", 1, reference)] if reference else []
-    missing = [job for job in jobs if not (folder / f"{job[0]}.exr").exists()]
+    missing = [job for job in [*jobs, ("ref", 1, REFERENCE)] if not (folder / f"{job[0]}.exr").exists()]
     if not missing:
         return
     stage = scenes.build(seed)
@@ -85,23 +85,17 @@ def render(out: Path, seed: int, pixel_filter: str, size: tuple[int, int], refer
     image.color_depth, image.exr_codec = "16", "ZIP"
     scene.cycles.pixel_filter_type, scene.cycles.filter_width = pixel_filter, 1.5
     for name, scale, spp in missing:
-        write_frame(scene, folder / f"{name}.exr", [side // scale for side in size], spp, f"{seed} {name}")
+        write_frame(scene, folder / f"{name}.exr", [side // scale for side in SIZE], spp, f"{seed} {name}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--seeds", type=int, nargs="*", help="other seeds, with the filters in turn")
-    parser.add_argument("--size", default="x".join(map(str, SIZE)), metavar="WIDTHxHEIGHT", help="multiples of 4")
-    parser.add_argument("--reference", type=int, default=512, help="spp; 0 for none")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
-    width, height = (int(side) for side in args.size.split("x"))
-    filters = itertools.cycle(pixel_filter for _, pixel_filter in VIEWS)
-    views = zip(args.seeds, filters, strict=False) if args.seeds else VIEWS
-    for seed, pixel_filter in views:
+    for seed, pixel_filter in VIEWS:
         start = time.perf_counter()
-        render(args.out, seed, pixel_filter, (width, height), args.reference, args.threads)
+        render(args.out, seed, pixel_filter, args.threads)
         print(f"seed {seed}, {pixel_filter}: {time.perf_counter() - start:.0f} s", flush=True)
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from oiio_msspl.image.filters import box_downsample
 from research.datagen import command_line, quality, samples, views
 from research.datagen.mitsuba import VARIANT, start
+from research.datagen.references import denoised
 
 if TYPE_CHECKING:  # Mitsuba's types exist only after a variant is set
     import mitsuba as mi
@@ -66,14 +67,6 @@ def _reference(scene: mi.Scene, camera: Camera, spp: int, seed: int) -> tuple[di
             return {name: halves[name].sum(axis=0) * (cells**2 / done) for name in names}, done, psnr
 
 
-def _denoised(images: dict[str, np.ndarray]) -> np.ndarray:
-    """Denoise the reference's cells by Open Image Denoise."""
-    import pyoidn
-
-    color, albedo, normal = (np.ascontiguousarray(images[n], np.float32) for n in ("color", "albedo", "normal"))
-    return pyoidn.denoise(color, albedo=albedo.clip(0, 1), normal=normal, hdr=True, quality="high")
-
-
 def render_view(
     scene: mi.Scene, plan: Scene, camera: Camera, seed: int, view: int, split: str, ref_spp: int, *, keep_noise: bool
 ) -> dict[str, np.ndarray] | None:
@@ -112,7 +105,7 @@ def render_view(
     if keep_noise:
         layers = {name: images[name] for name in ("albedo", "normal")}
         return samples.pack(hr, lr, images["color"], rng, meta, layers)
-    return samples.pack(hr, lr, images["color"] if split == "test" else _denoised(images), rng, meta)
+    return samples.pack(hr, lr, images["color"] if split == "test" else denoised(**images), rng, meta)
 
 
 def render_scene(args: argparse.Namespace, assets: Assets, seed: int) -> tuple[int, str]:

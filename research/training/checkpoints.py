@@ -26,10 +26,7 @@ from research.training.render_mean import with_mean
 
 State = dict[str, Any]
 Network = MultiResolutionFusion | JointFusion
-NETWORKS: dict[str, type[MultiResolutionFusion] | type[JointFusion]] = {
-    "paper": MultiResolutionFusion,
-    "joint": JointFusion,
-}
+NETWORKS: dict[str, type[Network]] = {"paper": MultiResolutionFusion, "joint": JointFusion}
 log = logging.getLogger(__name__)
 
 #: Parts of a checkpoint that only a continued run needs.

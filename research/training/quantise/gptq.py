@@ -199,9 +199,8 @@ class Fit:
             tops = tops**OWN_RANGE * tops.max() ** (1 - OWN_RANGE)
             slices = torch.ones(rectified, dtype=torch.long)
             if name in self.shape.up[-1]:
-                extra = self.extra_slices
-                if extra is None:
-                    extra = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
+                usual = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
+                extra = usual if self.extra_slices is None else self.extra_slices
                 slices = slices_per_channel(self._noise_gain(name) * tops**2, extra)
         # The first slice of every channel, then the second slice of those that have one, ...
         nth, source = (torch.arange(int(slices.sum()))[:, None] < slices).nonzero(as_tuple=True)

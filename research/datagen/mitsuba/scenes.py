@@ -261,18 +261,16 @@ class Scene:
         if gap:
             door = rng.uniform(0.4, w - 1.4)
             holes[0].append((door, 0.01, door + gap, 2.0))
-        up = geo.rotation((1, 0, 0), -np.pi / 2)
+        along, across, up = np.eye(3), geo.rotation((0, 0, 1), np.pi / 2), geo.rotation((1, 0, 0), -np.pi / 2)
+        front = (-w / 2, -d / 2 - t, 0)
+        places = [
+            (along, front), (along, (-w / 2, d / 2, 0)),
+            (across, front), (across, (w / 2 + t, -d / 2 - t, 0)), (up, (-w / 2, -d / 2, h + t)),
+        ]  # fmt: skip
 
         def place(mesh: Mesh, side: int) -> Mesh:
-            if side == 0:
-                return mesh.moved(-w / 2, -d / 2 - t, 0)
-            if side == 1:
-                return mesh.moved(-w / 2, d / 2, 0)
-            if side == 2:
-                return mesh.turned(np.pi / 2).moved(-w / 2, -d / 2 - t, 0)
-            if side == 3:
-                return mesh.turned(np.pi / 2).moved(w / 2 + t, -d / 2 - t, 0)
-            return mesh.rotated(up).moved(-w / 2, -d / 2, h + t)
+            turn, at = places[side]
+            return mesh.rotated(turn).moved(*at)
 
         # Most rooms are painted light: light that fills the shadows is part of what makes an interior.
         same, light_paint = rng.random() < 0.6, rng.random() < 0.65
@@ -450,19 +448,12 @@ class Scene:
         panel = geo.rectangle(a, b)
         back = geo.box((-a / 2 - 0.02, -b / 2 - 0.02, -0.03), (a / 2 + 0.02, b / 2 + 0.02, -0.005))
         if rng.random() < 0.5:
-            x, y = rng.uniform(-0.35, 0.35, 2) * (w, d)
-
-            def place(m: Mesh) -> Mesh:
-                return m.moved(x, y, h - gap)
+            turn, at = np.eye(3), np.array([*rng.uniform(-0.35, 0.35, 2) * (w, d), h - gap])
         else:
             turn = geo.rotation((1, 0, 0), np.pi / 2)
-            x, z = rng.uniform(-0.35, 0.35) * w, rng.uniform(0.3, 0.9) * h
-
-            def place(m: Mesh) -> Mesh:
-                return m.rotated(turn).moved(x, -d / 2 + gap, z)
-
-        self.light(place(panel), self.tinted_light(2 / (a * b)))
-        self.add(place(back), mat.thing(rng, tex.plain(rng)))
+            at = np.array([rng.uniform(-0.35, 0.35) * w, -d / 2 + gap, rng.uniform(0.3, 0.9) * h])
+        self.light(panel.rotated(turn).moved(*at), self.tinted_light(2 / (a * b)))
+        self.add(back.rotated(turn).moved(*at), mat.thing(rng, tex.plain(rng)))
 
     def lamp_hidden(self) -> None:
         """Add a light behind a partition."""

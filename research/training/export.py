@@ -43,7 +43,7 @@ from research.training.paper import MultiResolutionFusion
 from research.training.quantise import joint
 from research.training.quantise.layers import Networks, quantised, varied
 from research.training.tracing import IR_VERSION, network_example, prepend, traced
-from research.training.whole_model import InTorch, example, quantised_denoiser, save, whole_model
+from research.training.whole_model import example, quantised_denoiser, run_in_torch, save, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
 #: frame itself, and with room for the rows that are decoded for the next tiles.
@@ -190,13 +190,13 @@ def parity(network: Network, path: Path, denoise: MeanDenoiser | None = None) ->
     """
     session, contract = load_network(path), Contract.of_file(path)
     fuse = network.fuse if isinstance(network, JointFusion) else partial(run, network)
-    model = InTorch(contract, fuse, denoise)
     block = contract.alignment * -(-6 // contract.alignment)  # at least six pixels
     worst = 0.0
     for height, width in ((4 * block, 4 * block), (3 * block, 5 * block)):
         inputs = example(contract, height, width, seed=height)
         (fused,) = session.run(["fused"], {name: values.numpy() for name, values in inputs.items()})
-        worst = max(worst, float((log_encode(torch.from_numpy(fused)) - log_encode(model(inputs))).abs().max()))
+        expected = run_in_torch(contract, inputs, fuse, denoise)
+        worst = max(worst, float((log_encode(torch.from_numpy(fused)) - log_encode(expected)).abs().max()))
     return worst
 
 

@@ -81,29 +81,23 @@ class Leave(nn.Module):
         return log_decode(encoded.clamp(0.0, MAX_ENCODED)) / exposure
 
 
-class InTorch(nn.Module):
-    """A whole model in PyTorch, in 32 bits.
+def run_in_torch(
+    contract: Contract, inputs: Mapping[str, Tensor], fuse: Callable[[Tensor, Tensor], Sequence[Tensor | None]],
+    denoise: Callable[..., Tensor] | None = None,
+) -> Tensor:  # fmt: skip
+    """Run a whole model in PyTorch, in 32 bits; return the fused image (1, 3, s*h, s*w), scene linear.
 
     Args:
         contract: of the model.
+        inputs: of the contract.
         fuse: the network, which reads encoded images and returns the fused one first.
         denoise: the denoiser of both renders' mean, if the contract has one.
     """
-
-    def __init__(
-        self, contract: Contract, fuse: Callable[[Tensor, Tensor], Sequence[Tensor | None]],
-        denoise: Callable[..., Tensor] | None = None,
-    ) -> None:  # fmt: skip
-        super().__init__()
-        self.enter, self.fuse, self.denoise = Enter(contract), fuse, denoise
-
-    def forward(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        """Return the fused image (1, 3, s*h, s*w), scene linear, for the inputs of the contract."""
-        lrhs, hrls, *mean = self.enter([inputs[name] for name in self.enter.contract.inputs])
-        if self.denoise is not None:
-            lrhs = torch.cat([lrhs, self.denoise(*mean)], dim=1)
-        fused: Tensor = Leave()(self.fuse(lrhs, hrls)[0], inputs["exposure"])
-        return fused
+    lrhs, hrls, *mean = Enter(contract)([inputs[name] for name in contract.inputs])
+    if denoise is not None:
+        lrhs = torch.cat([lrhs, denoise(*mean)], dim=1)
+    fused: Tensor = Leave()(fuse(lrhs, hrls)[0], inputs["exposure"])
+    return fused
 
 
 def whole_model(network: onnx.ModelProto, contract: Contract, denoiser: onnx.ModelProto | None) -> onnx.ModelProto:

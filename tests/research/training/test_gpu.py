@@ -16,7 +16,7 @@ from oiio_msspl.model.runtime import load_network  # noqa: E402
 from research.training import export, gpu  # noqa: E402
 from research.training.encoding import log_encode  # noqa: E402
 from research.training.joint import JointFusion  # noqa: E402
-from research.training.whole_model import InTorch, example  # noqa: E402
+from research.training.whole_model import example, run_in_torch  # noqa: E402
 
 
 @pytest.mark.parametrize("size", ["small", "large"])
@@ -34,7 +34,7 @@ def test_a_file_for_gpus_computes_what_the_network_does(tmp_path: Path, size: st
     names = ["fused", "log_error", *(["albedo", "normal"] if size == "large" else [])]
     found = dict(zip(names, session.run(names, {n: v.numpy() for n, v in inputs.items()}), strict=True))
     with torch.inference_mode():
-        expected = InTorch(contract, network.fuse, denoiser)(inputs)
+        expected = run_in_torch(contract, inputs, network.fuse, denoiser)
         difference = log_encode(torch.from_numpy(found["fused"])) - log_encode(expected)
     assert float(difference.abs().mean()) < 0.01
     assert {value.name for value in session.get_outputs()} == set(names)

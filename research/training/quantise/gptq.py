@@ -80,6 +80,11 @@ class Activations:
     layout: CodeLayout
 
 
+def activations(codes: Sequence[Tensor], layout: CodeLayout) -> Activations:
+    """Return the inputs of a network, whose exact values are those of their codes."""
+    return Activations([layout.dequantise(image[0])[None] for image in codes], list(codes), layout)
+
+
 @dataclass
 class QuantisedConv:
     """A convolution in 8 bits.
@@ -313,7 +318,6 @@ def quantise_mean_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tenso
     """
     scale = [1 / INPUT_SLICES / 255] * (3 * INPUT_SLICES) + [1 / 255] * 7
     layout = CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
-    inputs = Activations([layout.dequantise(image[0])[None] for image in codes], list(codes), layout)
     fit = Fit(shape, weights)
-    run_unet_on_activations(shape, [inputs], fit.conv)
+    run_unet_on_activations(shape, [activations(codes, layout)], fit.conv)
     return fit

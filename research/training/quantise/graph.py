@@ -114,7 +114,8 @@ class Nodes:
 
     def log_to_pu(self, values: str) -> str:
         """Convert log-encoded to PU-encoded radiance, by a table."""
-        self.constant("pu", pu_encoded_table())
+        radiance = log_decode(torch.linspace(0, LARGEST, ENTRIES, dtype=torch.double))
+        self.constant("pu", pu_encode(radiance.clamp_max(MAX_RADIANCE)).float().numpy())
         return self.table(values, LARGEST, "pu")
 
     def slices(self, values: str, count: int) -> list[str]:
@@ -135,12 +136,6 @@ class Nodes:
     def packed(self, planes: list[str], name: str) -> str:
         """Concatenate images and order them as a U-Net reads them, (1, H, W, C)."""
         return self.add("Transpose", [self.add("Concat", planes, f"{name}.planes", axis=1)], name, perm=[0, 2, 3, 1])
-
-
-def pu_encoded_table() -> np.ndarray:
-    """Return the PU-encoded values of ``ENTRIES`` evenly spaced log-encoded ones, from 0 to the largest: float32."""
-    radiance = log_decode(torch.linspace(0, LARGEST, ENTRIES, dtype=torch.double))
-    return pu_encode(radiance.clamp_max(MAX_RADIANCE)).float().numpy()
 
 
 class Graph(Nodes):

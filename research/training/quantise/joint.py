@@ -68,11 +68,7 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[gptq.Activations
         half = upsample(torch.cat([mean, low], dim=1), 2 ** (log2_scale(lrhs, hrls) - 1))
         for images, image in zip(codes, (full, half), strict=True):
             images.append(F.pad(image, (0, 0, 0, 0, 0, 1)))
-
-    return [
-        gptq.Activations([layout.dequantise(image[0])[None] for image in images], images, layout)
-        for images, layout in zip(codes, layouts, strict=True)
-    ]
+    return [gptq.activations(images, layout) for images, layout in zip(codes, layouts, strict=True)]
 
 
 def calibration_pairs(

@@ -15,7 +15,7 @@ from research.training.denoisers import LayerDenoisers
 from research.training.encoding import from_srgb, srgb
 from research.training.oidn import FineTunedUNet
 from research.training.quantise.codes import sliced
-from research.training.quantise.gptq import Activations, Fit, concatenated, run_unet_on_activations, sliced_layout
+from research.training.quantise.gptq import Fit, activations, concatenated, run_unet_on_activations, sliced_layout
 from research.training.quantise.graph import ENTRIES, Graph, Nodes
 
 #: Slices of albedo and normal before and after they are denoised.
@@ -44,19 +44,17 @@ def varied(images: Sequence[Tensor]) -> list[Tensor]:
     return result
 
 
-def fitted(network: FineTunedUNet, slices_out: int, images: Sequence[Activations]) -> tuple[Fit, list[Tensor]]:
-    """Quantise a network; also return its exact outputs (1, 3, H, W)."""
-    fit = Fit(network.shape, network.weights(), slices_out)
-    exact, codes = ([getattr(image, kind)[0] for image in images] for kind in ("exact", "codes"))
-    result = run_unet_on_activations(network.shape, [Activations(exact, codes, images[0].layout)], fit.conv)
+def fitted(network: FineTunedUNet, images: Sequence[Tensor]) -> tuple[Fit, list[Tensor]]:
+    """Quantise a network on its inputs, sRGB-encoded albedos or normals (1, 3, H, W) in [0, 1].
+
+    Returns:
+        The fit, and the exact outputs (1, 3, H, W).
+    """
+    codes = [F.pad(sliced(image, SLICES), (0, 0, 0, 0, 0, 1)) for image in images]
+    fit = Fit(network.shape, network.weights(), SLICES)
+    inputs = activations(codes, concatenated(sliced_layout(SLICES, 0)))
+    result = run_unet_on_activations(network.shape, [inputs], fit.conv)
     return fit, [image[:, :3].clamp(0, 1) for image in result.exact]
-
-
-def layer_codes(image: Tensor) -> Activations:
-    """Convert an sRGB-encoded albedo or a normal, (1, 3, H, W) in [0, 1], to the network's input."""
-    layout = concatenated(sliced_layout(SLICES, 0))
-    codes = F.pad(sliced(image, SLICES), (0, 0, 0, 0, 0, 1))
-    return Activations([layout.dequantise(codes[0])[None]], [codes], layout)
 
 
 def quantised(layers: LayerDenoisers, images: Sequence[Tensor]) -> tuple[Networks, list[tuple[Tensor, Tensor]]]:
@@ -65,8 +63,8 @@ def quantised(layers: LayerDenoisers, images: Sequence[Tensor]) -> tuple[Network
     Returns:
         The networks, and the denoised albedo and normal of every image, (1, 3, H, W) in [0, 1], exactly computed.
     """
-    albedo, albedos = fitted(layers.albedo, SLICES, [layer_codes(srgb(image[:, 3:6])) for image in images])
-    normal, normals = fitted(layers.normal, SLICES, [layer_codes(0.5 * image[:, 6:9] + 0.5) for image in images])
+    albedo, albedos = fitted(layers.albedo, [srgb(image[:, 3:6]) for image in images])
+    normal, normals = fitted(layers.normal, [0.5 * image[:, 6:9] + 0.5 for image in images])
     networks = {"albedo": Graph(albedo).model(), "normal": Graph(normal).model()}
     return networks, list(zip(map(from_srgb, albedos), normals, strict=True))
 

@@ -140,18 +140,13 @@ def apply(
     Returns:
         (C, H / s, W / s)
     """
-    k, _, height, width = values.shape
-    low_height, low_width = height // scale, width // scale
 
     def blocks(samples: Tensor) -> Tensor:
         """Reorder (K, ..., H, W) to (K * s * s, ..., h, w)."""
-        middle = samples.shape[1:-2]
-        split = samples.reshape(k, *middle, low_height, scale, low_width, scale)
-        n = split.ndim
-        order = (0, n - 3, n - 1, *range(1, n - 4), n - 4, n - 2)
-        return split.permute(order).reshape(k * scale**2, *middle, low_height, low_width)
+        split = samples.unflatten(-1, (-1, scale)).unflatten(-3, (-1, scale))
+        return split.movedim((-3, -1), (1, 2)).flatten(0, 2)
 
-    rows, columns = (torch.arange(n, device=place.device) % scale for n in (height, width))
+    rows, columns = (torch.arange(n, device=place.device) % scale for n in values.shape[-2:])
     x = blocks((place[..., 0] + columns) / scale)
     y = blocks((place[..., 1] + rows[:, None]) / scale)
     stacked = torch.cat([torch.ones_like(x)[:, None], blocks(values)], dim=1)

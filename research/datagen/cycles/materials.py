@@ -63,15 +63,8 @@ class Graph:
 
     def mix(self, factor: Socket | float, a: Any, b: Any, blend: str = "MIX") -> Socket:
         """Mix two colours, (3,) or sockets."""
-        node = self.tree.nodes.new("ShaderNodeMix")
-        node.data_type, node.blend_type = "RGBA", blend
-        sockets: list[tuple[int, Any]] = [(0, factor), (6, a), (7, b)]  # those of colours follow those of other types
-        for index, value in sockets:
-            if isinstance(value, _SOCKET):
-                self.tree.links.new(value, node.inputs[index])
-            else:
-                node.inputs[index].default_value = rgba(value) if np.ndim(value) == 1 else float(value)
-        return node.outputs[2]
+        inputs = {0: factor, 6: a, 7: b}  # sockets of colours follow those of other types
+        return self.add("ShaderNodeMix", inputs, data_type="RGBA", blend_type=blend).outputs[2]
 
     def span(self, value: Socket, low: float, high: float) -> Socket:
         """0..1 to low..high."""
@@ -333,9 +326,8 @@ def palette(rng: Rng) -> Material:
 def hair(rng: Rng) -> Material:
     graph = new("hair")
     if chance(rng, 0.5):
-        node = graph.add("ShaderNodeBsdfHairPrincipled", {"Roughness": rng.uniform(0.15, 0.5)}, parametrization="COLOR")
-        node.inputs["Color"].default_value = rgba(tex.color(rng, 0.05, 0.9))
-        return graph.surface(node)
+        inputs = {"Roughness": rng.uniform(0.15, 0.5), "Color": tex.color(rng, 0.05, 0.9)}
+        return graph.surface(graph.add("ShaderNodeBsdfHairPrincipled", inputs, parametrization="COLOR"))
     return graph.surface(graph.add("ShaderNodeBsdfDiffuse", {"Color": tex.color(rng)}))
 
 

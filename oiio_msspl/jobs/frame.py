@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from functools import partial
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
@@ -38,20 +39,36 @@ from oiio_msspl.jobs.timeline import Key
 from oiio_msspl.model.session import Session
 
 
+class State(IntEnum):
+    """How far a frame has come."""
+
+    FOUND = 0
+    """Its files are known."""
+    READ = 1
+    """Its pair is open and mapped. Its pixels are in memory, if there is room."""
+    AVERAGED = 2
+    """Its renders are averaged with those of its neighbours."""
+    FUSED = 3
+    """The network has fused it."""
+    SETTLED = 4
+    """Its picture is averaged with those of its neighbours, and its passes are fused."""
+    WRITTEN = 5
+    """Its EXR is on the disk."""
+
+
 class NoSuchView(InputError):
     """A frame lacks a view that other frames of the shot have."""
 
 
 @dataclass(eq=False)
 class ShotFrame:
-    """One view of a frame. Its attributes are set one after the other, on its way from being found to being written."""
+    """One view of a frame. ``state`` says which of its attributes are set."""
 
     files: FrameFiles
     view: str | None = None
     """The name of a view beside the first one; None for the first one, whose name may differ from frame to frame."""
     plan: ViewPlan = field(default_factory=ViewPlan)
-    is_read: bool = False
-    """Whether its pair is open and mapped. Its pixels are then in memory, if there is room."""
+    state: State = State.FOUND
     error: Exception | None = None
     """Why it did not come further."""
     warnings: list[Finding] = field(default_factory=list)
@@ -59,7 +76,7 @@ class ShotFrame:
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time by what it was spent on: ``read`` and ``fuse``."""
 
-    # Once it is read
+    # From READ on
     lr: MappedRender = field(init=False)
     hr: MappedRender = field(init=False)
     stored: tuple[MappedRender, MappedRender] = field(init=False)
@@ -77,7 +94,7 @@ class ShotFrame:
     passed_on: tuple[str, ...] = ()
     """Of the first view: why further views are not fused, one sentence each."""
 
-    # Once its renders are averaged with those of its neighbours
+    # From AVERAGED on
     averaged: RenderPair = field(init=False)
     """The means over neighbours; ``renders`` if there are none. Given up when the frame is fused."""
     means: tuple[Render, Render] | None = None
@@ -88,7 +105,7 @@ class ShotFrame:
     session: Session = field(init=False)
     """The model for the scale of the pair."""
 
-    # Once the network has fused it
+    # From FUSED on
     fused: FusedFrame | None = None
     """As the network fused it, for as long as a frame needs it."""
     replaced: ReplacedChannels | None = None
@@ -97,7 +114,7 @@ class ShotFrame:
     progress: Progress | None = None
     """Joins the progress of the parts of the work, if somebody wants to know it."""
 
-    # Once its picture is averaged with those of its neighbours, and its passes are fused
+    # From SETTLED on
     picture: FusedFrame | None = None
     """What is written, until it is."""
     report: FrameReport = field(init=False)
@@ -168,10 +185,10 @@ def read_frame(files: FrameFiles, settings: Settings, plan: ShotPlan, *, only_fr
             with frame.attempt():
                 if not only_frame:
                     _read_pixels(frame)
-                frame.is_read = True
+                frame.state = State.READ
         first.seconds["read"] = time.perf_counter() - start
     for frame in frames[1:]:
-        if not frame.is_read and frame.error is None:
+        if frame.state < State.READ and frame.error is None:
             frame.error = first.error or NoSuchView(f"it has no pair for {name_of(frame.view or '')}")
     return frames
 
@@ -190,7 +207,7 @@ def _open(frames: Sequence[ShotFrame], settings: Settings) -> list[ShotFrame]:
     pairs[None] = views[0]
     present = [frame for frame in frames if frame.view in pairs]
     planned = {frame.view for frame in frames}
-    first.others = [ShotFrame(files, name, is_read=True) for name in pairs if name not in planned]
+    first.others = [ShotFrame(files, name, state=State.READ) for name in pairs if name not in planned]
     for frame in (*present, *first.others):
         _set_pair(frame, *pairs[frame.view], settings)
     return present

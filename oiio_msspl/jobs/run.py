@@ -39,7 +39,7 @@ from oiio_msspl.fusion.tiles.tiling import require_memory, strips_memory
 from oiio_msspl.image.arrays import HALF_MAX, kept
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.existing import ExistingResults
-from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, features_read, read_frame
+from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State, features_read, read_frame
 from oiio_msspl.jobs.memory import check_frame_memory, light_features
 from oiio_msspl.jobs.passes import Progress, costs_of, sets_to_fuse
 from oiio_msspl.jobs.plan import ShotPlan
@@ -134,12 +134,14 @@ class ShotRun:
             frame.averaged = frame.read_if_small() if self._only_frame else frame.renders
             if frame.plan.reach.renders:
                 self._average_renders(frame)
+            frame.state = State.AVERAGED
             if self._tell is not None:
                 views = [view.hr for view in (*frame.others, frame)]
                 frame.progress = Progress(self._tell, costs_of(views, frame.session, frame.write))
             if frame.number in self._wanted:
                 self._fuse_others(frame)
             frame.fused = self.fuse(frame)
+            frame.state = State.FUSED
             if frame.plan.reach.results:
                 _keep(frame.fused)
         frame.seconds["fuse"] = time.perf_counter() - start
@@ -226,6 +228,7 @@ class ShotRun:
             busy = sum(frame.seconds["fuse"] for frame in views) + time.perf_counter() - start
             network = first.report.network_seconds
             first.report.seconds = {"read": first.seconds["read"], "fuse": busy, "network": network}
+            first.state = State.SETTLED
 
     def _report(self, first: ShotFrame, picture: FusedFrame, others: Sequence[ShotFrame]) -> FrameReport:
         """Report on a frame that is settled: its first view with the final picture, and its other views."""
@@ -283,8 +286,7 @@ class ShotRun:
 
         def frame_of(number: int) -> tuple[MotionFrame, Any]:
             other = self._frames[number, frame.view]
-            content = other.fused if kind == "results" else other.renders if other.is_read else None
-            if content is None:
+            if other.state < (State.FUSED if kind == "results" else State.READ):
                 assert other.error is not None
                 if isinstance(other.error, InputError):
                     raise other.error  # its files can't be used, so it is left out in every run
@@ -292,6 +294,7 @@ class ShotRun:
                 reason = explain(other.error)[0]
                 raise MssplError(f"frame {number}, its neighbour, has failed: {reason}") from other.error
             picture = None if other.fused is None else other.fused.rgb
+            content = other.fused if kind == "results" else other.renders
             return MotionFrame(other.hr, picture, other.vectors, other.renders.hr, number, other.lr), content
 
         motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, kind)
@@ -304,7 +307,7 @@ class ShotRun:
             if key not in renders | pictures:
                 del self._frames[key]
                 continue
-            if key not in renders and frame.is_read:
+            if key not in renders and frame.state >= State.READ:
                 frame.renders = RenderPair(*frame.stored)  # the files can still be read
             if key not in pictures:
                 frame.fused = None

@@ -37,7 +37,7 @@ from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY
 from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.image.parallel import in_background
 from oiio_msspl.jobs.existing import ExistingResults
-from oiio_msspl.jobs.frame import ShotFrame
+from oiio_msspl.jobs.frame import ShotFrame, State
 from oiio_msspl.jobs.report import provenance
 
 log = logging.getLogger(__name__)
@@ -115,7 +115,7 @@ def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bo
             if report.preview is not None and not report.output.exists():
                 report.preview.unlink(missing_ok=True)
             raise
-    frame.picture = None
+    frame.state, frame.picture = State.WRITTEN, None
     report.seconds["write"] = time.perf_counter() - start
     log.debug("report: %s", report.as_dict())
 

@@ -170,31 +170,36 @@ def make_job(
             raise InputError(f"packages of {manager!r}: use one of {', '.join(PACKAGES)}")
         said = "Packages that the environment of the queue installs"
         _add(job, PACKAGES[manager], wanted, said, "LINE_EDIT", f"{manager.title()} packages", type="STRING")
-    program, *first_arguments = _words_of(command)
-    action = {
-        "command": program,
-        "args": [*first_arguments, *arguments],
-        "timeout": chunk * timeout,
-        "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": GRACE},
-    }
     chunks = {"defaultTaskCount": size, "rangeConstraint": "NONCONTIGUOUS"}
     task_frames = {"name": "Frame", "type": "CHUNK[INT]", "range": frame_range, "chunks": chunks}
     amounts = [{"name": "amount.worker.memory", "min": -(-memory // 2**20)}]  # MiB, as much as a task may take
     if device in GPUS:
         amounts.append({"name": "amount.worker.gpu", "min": 1})
-    step = {
+    job.template.update(
+        specificationVersion="jobtemplate-2023-09",
+        extensions=["TASK_CHUNKING"],
+        name=_literal(name or _name_of(shot))[:_LONGEST_NAME],
+        steps=[_step([*_words_of(command), *arguments], chunk * timeout, task_frames, amounts)],
+    )
+    return job
+
+
+def _step(
+    words: Sequence[str], seconds: int, task_frames: dict[str, Any], amounts: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """Describe the step that fuses the frames of a task by a program and its arguments, in so many seconds."""
+    action = {
+        "command": words[0],
+        "args": list(words[1:]),
+        "timeout": seconds,
+        "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": GRACE},
+    }
+    return {
         "name": "Fuse",
         "parameterSpace": {"taskParameterDefinitions": [task_frames]},
         "hostRequirements": {"amounts": amounts},
         "script": {"actions": {"onRun": action}},
     }
-    job.template.update(
-        specificationVersion="jobtemplate-2023-09",
-        extensions=["TASK_CHUNKING"],
-        name=_literal(name or _name_of(shot))[:_LONGEST_NAME],
-        steps=[step],
-    )
-    return job
 
 
 def _name_of(shot: Shot) -> str:

@@ -4,19 +4,25 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.checks.spread_noise import CACHE_BYTES, blocks_of, correlations_in, noise_in, sample_windows
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features
+from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features, read_lrhs
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.contract import ONE_SIZE
 from oiio_msspl.model.encoding import encode_radiance, find_exposure
+from oiio_msspl.model.render_mean import lrhs_share
 
 #: Standard deviation of the noise in blocks, log-encoded, and the share of the blocks with less: the others may have
 #: texture. Path-traced rooms have this noise at some 16 to 32 spp.
 LITTLE, SMOOTH = 0.07, 0.25
+#: The same for pairs of two sizes, by scale, whose difference is free of texture. Networks for more noise lose more
+#: detail, and so more noise is little, the larger the LRHS's pixels are.
+LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
 #: The same for noise that a filter has spread, for each HRLS pixel along a side of one of the LRHS: the wider these
 #: are, the less they tell of detail.
 LITTLE_SPREAD = 0.009
@@ -30,6 +36,16 @@ def has_little_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignmen
 
     Small samples all over the frame are read. ``spread``: a filter has spread the noise over neighbouring pixels.
     """
+    scale = alignment.scale
+    if spread or scale == ONE_SIZE:
+        limit, found = (LITTLE_SPREAD * scale if spread else LITTLE), _noise_in_blocks(lr, hr, alignment)
+    else:
+        limit, found = LITTLE_OF_PAIR[scale], _noise_by_difference(lr, hr, alignment)
+    return len(found) > 0 and bool(np.quantile(found, SMOOTH) < limit)
+
+
+def _noise_in_blocks(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> NDArray[np.float64]:
+    """Return the deviation (n) of the pixels of blocks from a smooth course. Fine texture counts, too."""
     deviations, window, scale = [], alignment.hr_data_window, alignment.scale
     with hr.cache_strips(CACHE_BYTES), lr.cache_strips(CACHE_BYTES):
         for grid in sample_windows(alignment.grid):
@@ -39,8 +55,27 @@ def has_little_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignmen
                 mean = (mean + read_features(lr, area, window, [RGB])[RGB]) / np.float32(2)
             image = encode_radiance(luminance(mean)[..., None], find_exposure(mean))[..., 0]
             deviations.append(noise_in(blocks_of(image)).std(axis=(1, 2)))
-    found = np.concatenate(deviations)
-    return len(found) > 0 and bool(np.quantile(found, SMOOTH) < (LITTLE_SPREAD * scale if spread else LITTLE))
+    return np.concatenate(deviations)
+
+
+def _noise_by_difference(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> NDArray[np.float64]:
+    """Return the deviation (n) of an HRLS pixel's noise in blocks, by the difference of both renders.
+
+    For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel.
+    """
+    lows, highs = [], []
+    with hr.cache_strips(CACHE_BYTES), lr.cache_strips(CACHE_BYTES):
+        for grid in sample_windows(alignment.grid):
+            low = read_lrhs(lr, alignment, grid, [RGB])[RGB]
+            area = in_hrls_pixels(grid, alignment.scale)
+            high = read_features(hr, area, alignment.hr_data_window, [RGB])[RGB]
+            exposure = find_exposure(low)
+            lows.append(encode_radiance(low, exposure))
+            highs.append(encode_radiance(box_downsample(high, alignment.scale), exposure))
+    gain = alignment.scale * np.sqrt(lrhs_share(np.stack(lows), np.stack(highs)))
+    differences = [blocks_of(luminance(low - high)) * gain for low, high in zip(lows, highs, strict=True)]
+    deviations = np.sqrt(np.mean(np.square(np.concatenate(differences), dtype=np.float64), axis=1))
+    return deviations[deviations > 0]  # where both are black there is no noise
 
 
 def has_clean_aovs(hr: ReadableRender, alignment: Alignment) -> bool:

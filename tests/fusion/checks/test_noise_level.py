@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl.exr.render import Render
-from oiio_msspl.fusion.checks.noise_level import has_clean_aovs
+from oiio_msspl.fusion.checks.noise_level import has_clean_aovs, has_little_noise
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.jobs.settings import family_for_noise
@@ -50,3 +50,17 @@ def test_only_best_takes_the_model_for_little_noise_if_aovs_are_noisy(samples):
     hr = render_of(albedo, 0.02)
     for family, clean in (("joint-large", True), ("joint", samples == 64)):
         assert family_for_noise(family, hr, hr, align(hr, hr))[0] == family + "-clean" * clean
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize(("noise", "little"), [(0.03, True), (0.3, False)])
+def test_fine_texture_of_a_pair_is_no_noise(scale, noise, little):
+    """Both renders show it. One render alone can't tell them apart."""
+    rng = np.random.default_rng(0)
+    texture = rng.uniform(0.2, 0.8, (4 * SIZE, 4 * SIZE, 1))
+    lr, hr = (
+        Render.from_arrays(rgb=(image * rng.normal(1, noise / size, image.shape)).astype(np.float32).repeat(3, -1))
+        for size, image in ((scale, box_downsample(texture, scale)), (1, texture))
+    )
+    assert has_little_noise(lr, hr, align(lr, hr)) is little
+    assert not has_little_noise(hr, hr, align(hr, hr))

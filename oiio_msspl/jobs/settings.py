@@ -12,7 +12,12 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.checks.noise_level import has_clean_aovs, has_little_noise
+from oiio_msspl.fusion.checks.noise_level import (
+    CLEAN_AOVS,
+    CLEAN_AOVS_OF_PAIR,
+    has_clean_aovs,
+    has_little_noise,
+)
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
@@ -158,7 +163,7 @@ def family_for_noise(
     clean = None if error else for_little_noise(family + kind, scale)
     if clean and has_little_noise(lr, hr, alignment, spread=bool(spread)):
         denoises_aovs = spread or (family == QUALITIES["best"] and scale == ONE_SIZE)
-        if denoises_aovs or has_clean_aovs(hr, alignment):
+        if denoises_aovs or has_clean_aovs(hr, alignment, CLEAN_AOVS if scale == ONE_SIZE else CLEAN_AOVS_OF_PAIR):
             return clean, kind + CLEAN
     return family + kind, None if spread is None else kind
 

@@ -28,7 +28,9 @@ LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
 LITTLE_SPREAD = 0.009
 #: Blocks of an AOV show edges or texture from this variance on. There, neighbouring pixels of clean AOVs correlate by
 #: more than the second number, in the mean: at 1, 2, 4, 8 and 16 spp by some 0.27, 0.37, 0.44, 0.47 and 0.50.
-EDGES, CLEAN = 1e-4, 0.46
+EDGES, CLEAN_AOVS = 1e-4, 0.46
+#: The same for pairs of two sizes, whose difference tells smooth rooms of few spp from clean ones.
+CLEAN_AOVS_OF_PAIR = 0.42
 
 
 def has_little_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, spread: bool = False) -> bool:
@@ -78,7 +80,7 @@ def _noise_by_difference(lr: ReadableRender, hr: ReadableRender, alignment: Alig
     return deviations[deviations > 0]  # where both are black there is no noise
 
 
-def has_clean_aovs(hr: ReadableRender, alignment: Alignment) -> bool:
+def has_clean_aovs(hr: ReadableRender, alignment: Alignment, least: float = CLEAN_AOVS) -> bool:
     """Return whether albedo and normal of an HRLS have hardly any noise, or no edge that could show it.
 
     At an edge, the few samples of a pixel fall on either side by chance, so neighbouring pixels differ more than those
@@ -95,4 +97,4 @@ def has_clean_aovs(hr: ReadableRender, alignment: Alignment) -> bool:
                     shows = variance > EDGES
                     variances.append(variance[shows])
                     products.append(variance[shows] * correlations_in(residual[shows]))
-    return bool(np.concatenate(products).sum() >= CLEAN * np.concatenate(variances).sum())
+    return bool(np.concatenate(products).sum() >= least * np.concatenate(variances).sum())

@@ -346,16 +346,24 @@ INPUTS = {
     f"best-x1{SEEDS}": ("two seeds", "`--quality best`"),
 }
 
+def _inputs_at(spp: tuple[int, int]) -> list[Column]:
+    """Return the columns of some spp: that of one render or of two sizes, and the nearest one of two seeds."""
+    title, where = f"{spp[0]} spp (seeds: {spp[1]})", {"spp": lambda value: value in spp}
+    return [
+        Column(title, "psnr", where | {"scene": MEAN}),
+        Column("minus OIDN, prefiltered", "psnr", where | {"scene": clean}, "interval"),
+    ]
+
+
 ONE_RENDER_OR_TWO = Table(
     ("one_size",),
     BY_SCENE,
-    ("spp", "input", "PSNR of"),
+    ("input", "PSNR of"),
     [
-        Line([str(spp), *cells], {"method": method, "spp": spp})
-        for spp in (2, 3, 8, 12, 32, 48, 128, 192)
+        Line(cells, {"method": method}, {"method": "OIDN prefiltered" + (SEEDS if method.endswith(SEEDS) else "")})
         for method, cells in INPUTS.items()
     ],
-    [Column(name, "psnr", {"scene": name}) for name in SCENES if name not in NOISY_REFERENCE],
+    [column for spp in ((2, 3), (8, 12), (32, 48), (128, 192)) for column in _inputs_at(spp)],
 )
 
 #: The row of :mod:`research.benchmarks.ablations` that several findings need.

@@ -214,7 +214,8 @@ def _window_sums(values: Array, size: int, axis: int) -> Array:
         if size & width:
             parts.append(lines[start : start + count])
             start += width
-        lines, width = lines[width:] + lines[:-width], 2 * width
+        if start < size:
+            lines, width = lines[width:] + lines[:-width], 2 * width
     return reduce(np.add, parts).swapaxes(0, axis)
 
 

@@ -25,7 +25,7 @@ from oiio_msspl.fusion.neighbours.bands import for_bands, rows_in_bands, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
 from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS, Features, RenderBand, RenderPair, read
 from oiio_msspl.fusion.neighbours.results import Images, ResultBand, images_of
-from oiio_msspl.fusion.neighbours.trust import Judge, Light, RenderLight, ResultLight
+from oiio_msspl.fusion.neighbours.trust import COARSE, Judge, Light, RenderLight, ResultLight
 from oiio_msspl.image.arrays import Array, blank, unload
 from oiio_msspl.image.parallel import two_at_a_time
 
@@ -130,7 +130,7 @@ def _average(
     """Average a frame with its neighbours, band by band, and return the number of frames (h, w, 1)."""
     window = light.alignment.hr_data_window
     frames: Array = blank((window.height, window.width, 1))
-    coarse_light = light.coarser()
+    coarse_light = light.coarser() if light.cell < COARSE // 2 else light
     sides = two_at_a_time(lambda hops: (hops, _coarse_trust(coarse_light, hops, colours_of)), (before, after))
 
     def work(core: Window, area: Window) -> None:

@@ -75,8 +75,9 @@ def _noise_by_difference(lr: ReadableRender, hr: ReadableRender, alignment: Alig
             lows.append(encode_radiance(low, exposure))
             highs.append(encode_radiance(box_downsample(high, alignment.scale), exposure))
     gain = alignment.scale * np.sqrt(lrhs_share(np.stack(lows), np.stack(highs)))
-    differences = [blocks_of(luminance(low - high)) * gain for low, high in zip(lows, highs, strict=True)]
-    deviations = np.sqrt(np.mean(np.square(np.concatenate(differences), dtype=np.float64), axis=1))
+    # All colours count alike: blue noise is hardly seen in luminance.
+    squares = [np.square(low - high, dtype=np.float64).mean(axis=-1) for low, high in zip(lows, highs, strict=True)]
+    deviations = gain * np.sqrt(np.concatenate([blocks_of(plane) for plane in squares]).mean(axis=1))
     return deviations[deviations > 0]  # where both are black there is no noise
 
 

@@ -346,6 +346,7 @@ INPUTS = {
     f"best-x1{SEEDS}": ("two seeds", "`--quality best`"),
 }
 
+
 def _inputs_at(spp: tuple[int, int]) -> list[Column]:
     """Return the columns of some spp: that of one render or of two sizes, and the nearest one of two seeds."""
     title, where = f"{spp[0]} spp (seeds: {spp[1]})", {"spp": lambda value: value in spp}

@@ -224,14 +224,17 @@ def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
 
     Pixels beyond the edge do not count.
     """
-    height, width = plane.shape
+    (height, width), most = plane.shape, max(reaches)
     results = [np.empty((height, width), np.float32) for _ in reaches]
 
     def work(rows: slice) -> None:
+        top, bottom = max(rows.start - most, 0), min(rows.stop + most, height)
+        first = top - rows.start + most
+        padded = np.zeros((rows.stop - rows.start + 2 * most, width + 2 * most), np.float32)
+        padded[first : first + bottom - top, most : most + width] = plane[top:bottom]
         for reach, result in zip(reaches, results, strict=True):
-            top, bottom = max(rows.start - reach, 0), min(rows.stop + reach, height)
-            margins = [(top - rows.start + reach, rows.stop + reach - bottom), (reach, reach)]
-            sums = np.pad(plane[top:bottom], margins)
+            rest = most - reach
+            sums = padded[rest : len(padded) - rest, rest : width + 2 * most - rest]
             for axis in (0, 1):
                 sums = _window_sums(sums, 2 * reach + 1, axis)
             lines, columns = (

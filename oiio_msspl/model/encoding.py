@@ -32,6 +32,9 @@ MAX_ALBEDO = 2.0
 EXPOSURE_BOUNDS = (2e-34, 1e38)
 #: Pixels darker than this fraction of a frame's bright pixels (33 stops below) do not count for its exposure.
 NO_LIGHT = 1e-10
+#: A pixel counts with at least this share of its brightest channel. Blue light has hardly any luminance, and exposed by
+#: that it would be so bright that networks lose a quarter of it.
+SATURATED = np.float32(0.5)
 #: Side, in pixels, of the squares that show how noisy a frame is, and the number that a frame must have: with fewer,
 #: one lamp could decide.
 BLOCK, MIN_BLOCKS = 8, 64
@@ -45,7 +48,7 @@ MAX_ENCODED = float(np.log1p(MU * MAX_RADIANCE)) * float(_LOG_SCALE)
 
 
 def find_exposure(rgb: Array) -> float:
-    """Return the factor that brings a render to a log-mean luminance of ``KEY``.
+    """Return the factor that brings a render to a log-mean luminance of ``KEY``, or a saturated one to a darker one.
 
     Only lit pixels count. Noise makes most pixels darker than their mean, and a few much brighter, so the log-mean of a
     very noisy frame is far too dark. Networks average log-encoded radiance, which loses light if the few bright pixels
@@ -59,7 +62,8 @@ def find_exposure(rgb: Array) -> float:
     Returns:
         The factor, within ``EXPOSURE_BOUNDS``; 1.0 for a black render.
     """
-    y = luminance(rgb)
+    brightest = np.maximum(np.maximum(rgb[..., 0], rgb[..., 1]), rgb[..., 2])
+    y = np.maximum(luminance(rgb), SATURATED * brightest)
     lit = y[y > 0]
     if lit.size == 0:
         return 1.0

@@ -20,7 +20,17 @@ from torch.nn import functional as F
 from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import LUMINANCE_WEIGHTS
-from oiio_msspl.model.encoding import BLOCK, KEY, MAX_ALBEDO, MAX_RADIANCE, MIN_BLOCKS, MU, NO_LIGHT, NOISY
+from oiio_msspl.model.encoding import (
+    BLOCK,
+    KEY,
+    MAX_ALBEDO,
+    MAX_RADIANCE,
+    MIN_BLOCKS,
+    MU,
+    NO_LIGHT,
+    NOISY,
+    SATURATED,
+)
 
 #: Factor of the logarithm, which makes a log-encoded radiance of 1 a 1.
 LOG_SCALE = 1.0 / math.log1p(MU)
@@ -106,7 +116,7 @@ def repair(values: Tensor, *, signed: bool = False) -> Tensor:
 
 def exposure_of(lrhs: Tensor) -> Tensor:
     """Return the exposure (N,) of each image (N, h, w, 3), as :func:`oiio_msspl.model.encoding.find_exposure`."""
-    y = luminance(lrhs)
+    y = torch.maximum(luminance(lrhs), float(SATURATED) * lrhs.amax(dim=-1))
     lit = torch.where(y > 0, y, torch.nan).flatten(1)
     bright = lit.nanquantile(0.99, dim=1, keepdim=True)
     exposure = KEY / _log_mean(lit, NO_LIGHT * bright)

@@ -37,6 +37,14 @@ def test_exposure_brings_the_log_mean_to_mid_grey():
     assert find_exposure(scene) == pytest.approx(9.0, rel=1e-3)
 
 
+@pytest.mark.parametrize("channel", range(3))
+def test_saturated_light_is_not_brighter_to_the_network_than_white(channel):
+    """Blue has 7 percent of the luminance of white, and would be 14 times as bright."""
+    light = np.zeros((64, 64, 3), np.float32)
+    light[..., channel] = 0.3
+    assert 0.3 * encoding.find_exposure(light) <= 2.001 * encoding.KEY
+
+
 def test_traces_of_light_do_not_decide_the_exposure():
     """What a pixel filter or a float leaves between small lights is no light."""
     scene = np.full((8, 8, 3), 1e-40, np.float32)

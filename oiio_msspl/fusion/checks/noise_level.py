@@ -8,9 +8,16 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.exr.render import ReadableRender
-from oiio_msspl.fusion.checks.spread_noise import CACHE_BYTES, blocks_of, correlations_in, noise_in, sample_windows
+from oiio_msspl.fusion.checks.spread_noise import (
+    CACHE_BYTES,
+    blocks_of,
+    correlations_in,
+    noise_in,
+    sample_windows,
+    samples_of,
+)
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features, read_lrhs
+from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.contract import ONE_SIZE
@@ -20,11 +27,10 @@ from oiio_msspl.model.render_mean import lrhs_share
 #: Standard deviation of the noise in blocks, log-encoded, and the share of the blocks with less: the others may have
 #: texture. Path-traced rooms have this noise at some 16 to 32 spp.
 LITTLE, SMOOTH = 0.07, 0.25
-#: The same for pairs of two sizes, by scale, whose difference is free of texture. Networks for more noise lose more
-#: detail, and so more noise is little, the larger the LRHS's pixels are.
+#: The limit for pairs of two sizes, by scale. Their difference is free of texture. The larger the pixels of the LRHS,
+#: the more detail the models for more noise lose, so the limit grows.
 LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
-#: The same for noise that a filter has spread, for each HRLS pixel along a side of one of the LRHS: the wider these
-#: are, the less they tell of detail.
+#: The limit for noise that a filter has spread is this number times the scale. It grows for the same reason.
 LITTLE_SPREAD = 0.009
 #: Blocks of an AOV show edges or texture from this variance on. There, neighbouring pixels of clean AOVs correlate by
 #: more than the second number, in the mean: at 1, 2, 4, 8 and 16 spp by some 0.27, 0.37, 0.44, 0.47 and 0.50.
@@ -66,14 +72,9 @@ def _noise_by_difference(lr: ReadableRender, hr: ReadableRender, alignment: Alig
     For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel.
     """
     lows, highs = [], []
-    with hr.cache_strips(CACHE_BYTES), lr.cache_strips(CACHE_BYTES):
-        for grid in sample_windows(alignment.grid):
-            low = read_lrhs(lr, alignment, grid, [RGB])[RGB]
-            area = in_hrls_pixels(grid, alignment.scale)
-            high = read_features(hr, area, alignment.hr_data_window, [RGB])[RGB]
-            exposure = find_exposure(low)
-            lows.append(encode_radiance(low, exposure))
-            highs.append(encode_radiance(box_downsample(high, alignment.scale), exposure))
+    for low, high, exposure in samples_of(lr, hr, alignment):
+        lows.append(encode_radiance(low, exposure))
+        highs.append(encode_radiance(box_downsample(high, alignment.scale), exposure))
     gain = alignment.scale * np.sqrt(lrhs_share(np.stack(lows), np.stack(highs)))
     # All colours count alike: blue noise is hardly seen in luminance.
     squares = [np.square(low - high, dtype=np.float64).mean(axis=-1) for low, high in zip(lows, highs, strict=True)]

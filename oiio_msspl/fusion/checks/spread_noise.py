@@ -8,6 +8,7 @@ and denoisers that learnt from independent pixels take it for detail.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -50,26 +51,31 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
     also those without texture.
     """
     scale, correlations = alignment.scale, []
-    with hr.cache_strips(CACHE_BYTES):
-        for window in sample_windows(alignment.grid):
-            low = read_lrhs(lr, alignment, window, [RGB])[RGB]
-            area = in_hrls_pixels(window, scale)
-            high = read_features(hr, area, alignment.hr_data_window, [RGB])[RGB]
-            exposure = find_exposure(low)
-            mean, low, high = (
-                encode_radiance(luminance(image)[..., None], exposure)[..., 0]
-                for image in (box_downsample(high, scale), low, high)
-            )
-            difference = low - mean
-            dense = blocks_of(np.abs(difference) > ROUNDING).mean(axis=1) > DENSE
-            blocks = blocks_of(high), blocks_of(difference)[dense]
-            correlations.append([correlations_in(noise_in(part)) for part in blocks])
+    for low, high, exposure in samples_of(lr, hr, alignment):
+        mean, low, high = (
+            encode_radiance(luminance(image)[..., None], exposure)[..., 0]
+            for image in (box_downsample(high, scale), low, high)
+        )
+        difference = low - mean
+        dense = blocks_of(np.abs(difference) > ROUNDING).mean(axis=1) > DENSE
+        blocks = blocks_of(high), blocks_of(difference)[dense]
+        correlations.append([correlations_in(noise_in(part)) for part in blocks])
     hrls, difference = (np.concatenate(parts) for parts in zip(*correlations, strict=True))
     if lr is hr:
         return None if len(hrls) < FEWEST else bool(np.quantile(hrls, LEAST_CORRELATED) > SPREAD_HRLS)
     if min(len(hrls), len(difference)) < FEWEST:
         return None
     return bool(np.median(hrls) > SPREAD_HRLS and np.median(difference) > SPREAD_DIFFERENCE)
+
+
+def samples_of(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> Iterator[tuple[Array, Array, float]]:
+    """Yield the colours of LRHS (h, w, 3) and HRLS (s*h, s*w, 3) in :func:`sample_windows`, and their exposure."""
+    with hr.cache_strips(CACHE_BYTES), lr.cache_strips(CACHE_BYTES):
+        for window in sample_windows(alignment.grid):
+            low = read_lrhs(lr, alignment, window, [RGB])[RGB]
+            area = in_hrls_pixels(window, alignment.scale)
+            high = read_features(hr, area, alignment.hr_data_window, [RGB])[RGB]
+            yield low, high, find_exposure(low)
 
 
 def sample_windows(grid: Window) -> list[Window]:

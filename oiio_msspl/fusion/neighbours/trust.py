@@ -100,9 +100,8 @@ class Light(ABC):
     def coarser(self) -> Self:
         """Return the same light with cells of twice the size, for :meth:`coarse_trust`."""
         light = copy(self)
-        light._halvings, light.cell, light._steps, light._share = (
-            self._halvings + 1, self.cell * 2, self._steps - 1, self._share * 4,
-        )  # fmt: skip
+        light._halvings, light.cell = self._halvings + 1, self.cell * 2
+        light._steps, light._share = self._steps - 1, self._share * 4
         light._brightness, light._noise = _halved(self._brightness), _halved(self._noise) * np.float32(1 / 4)
         light.shape = light._noise.shape
         return light

@@ -48,6 +48,18 @@ class MeanDenoiser(oidn.FineTunedUNet):
         return pu_to_log(colour.clamp_max(1.0))
 
 
+class OwnDenoiser(oidn.FineTunedUNet):
+    """Open Image Denoise's large network as it is, which denoises one render at full size."""
+
+    def __init__(self) -> None:
+        super().__init__(oidn.LARGE_HDR, oidn.LARGE)
+
+    def forward(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """Denoise a render (N, 3, H, W), log-encoded. Its albedo and normal have no noise, and are in [0, 1]."""
+        denoised = self.run(torch.cat([log_to_pu(colour), albedo, normal], dim=1))
+        return pu_to_log(denoised.clamp_max(1.0))
+
+
 def mean_images(lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return what :class:`MeanDenoiser` reads, given the arguments of :func:`denoise_mean`."""
     _, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)

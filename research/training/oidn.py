@@ -131,6 +131,11 @@ class Shape:
     last: str
     """The convolution that returns the colour."""
 
+    @property
+    def order(self) -> list[str]:
+        """All convolutions in the order in which they run."""
+        return [*itertools.chain(*self.down), *self.bottom, *itertools.chain(*self.up), self.last]
+
 
 #: Small and base networks.
 BASE = Shape(

@@ -34,6 +34,8 @@ from research.training.quantise.graph import Nodes
 from research.training.render_mean import Images, mean_of_renders
 from research.training.tracing import image_info, traced
 
+#: File of the denoiser of one render at full size, in 8 bits.
+OWN_DENOISER = CHECKPOINTS / "own_denoiser.onnx"
 #: Prefixes of tensors in the graph of a model.
 ENTER, NETWORK, DENOISER = "enter.", "network.", "denoiser."
 #: Tensors of fewer bytes, such as biases, stay in the graph.
@@ -152,10 +154,15 @@ def _denoise(graph: Nodes, denoiser: onnx.ModelProto, images: list[str]) -> None
     # The slices of each colour lie side by side.
     order = graph.constant("by_colour", np.arange(3 * INPUT_SLICES).reshape(INPUT_SLICES, 3).T.ravel())
     layers = graph.packed([graph.add("Gather", [slices, order], "mean.by_colour", axis=1), *rest], "mean.layers")
-    graph.embed(denoiser, DENOISER, {"layers": layers, "codes": "mean.sums"})
+    add_quantised(graph, denoiser, DENOISER, layers, "mean.denoised")
+
+
+def add_quantised(graph: Nodes, denoiser: onnx.ModelProto, prefix: str, layers: str, output: str) -> None:
+    """Add a denoiser in 8 bits. Its picture ``output`` (1, 3, h, w) is log-encoded."""
+    graph.embed(denoiser, prefix, {"layers": layers, "codes": f"{output}.sums"})
     graph.constant("of_code", log_encoded_of_code(OUTPUT_SLICES))
-    pixels = graph.look_up("of_code", "mean.sums", "mean.pixels")
-    graph.add("Transpose", [pixels], "mean.denoised", perm=[0, 3, 1, 2])
+    pixels = graph.look_up("of_code", f"{output}.sums", f"{output}.pixels")
+    graph.add("Transpose", [pixels], output, perm=[0, 3, 1, 2])
 
 
 def _share_equal_tensors(graph: onnx.GraphProto) -> None:

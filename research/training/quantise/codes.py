@@ -11,6 +11,7 @@ import functools
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.model.encoding import encode_radiance
@@ -20,6 +21,8 @@ from research.training.encoding import log_to_pu, pu_decode
 INPUT_SLICES, OUTPUT_SLICES = 3, 10
 #: Its input channels: three colours in slices, albedo, normal and noise.
 INPUT_CHANNELS = 3 * INPUT_SLICES + 7
+#: Those of the denoiser of one render: colour and albedo in slices, normal, and zeros up to a multiple of four.
+OWN_CHANNELS = 24
 
 
 def sliced(values: Tensor, count: int) -> Tensor:
@@ -36,6 +39,21 @@ def denoiser_codes(colour: Tensor, noise: Tensor, albedo: Tensor, normal: Tensor
     slices = sliced(log_to_pu(colour), INPUT_SLICES).unflatten(1, (INPUT_SLICES, 3)).transpose(1, 2).flatten(1, 2)
     rest = torch.cat([albedo, 0.5 * normal + 0.5, noise], dim=1)
     return torch.cat([slices, rest.mul(255).round().clamp(0, 255)], dim=1)
+
+
+def own_codes(colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+    """Quantise what the denoiser of one render reads, (N, 3, H, W) each, to (N, OWN_CHANNELS, H, W).
+
+    A dark albedo is a few steps of 255, so it has slices, too.
+
+    Args:
+        colour: log-encoded.
+        albedo, normal: in [0, 1].
+    """
+    slices = [sliced(image, INPUT_SLICES) for image in (log_to_pu(colour), albedo)]
+    return F.pad(
+        torch.cat([*slices, normal.mul(255).round()], dim=1), (0, 0, 0, 0, 0, OWN_CHANNELS - 6 * INPUT_SLICES - 3)
+    )
 
 
 @functools.cache

@@ -13,7 +13,7 @@ row compensate for the error (Frantar et al. 2023, "GPTQ", after Hassibi and Sto
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,10 +43,17 @@ MAX_WEIGHT = 127
 #: Largest sum of the weights of one sign of a pair. ONNX Runtime multiplies the codes of two neighbouring input
 #: channels, and processors without VNNI instructions add both products in 16 bits. 255 times this fits.
 MAX_PAIR = 128
-#: Further code channels for each layer of the last level, for slices: rounding errors there go straight into the
-#: colour, mostly from a few channels. The large network has more channels there. Twice as many slices as these gain
-#: 0.01 dB at most.
-EXTRA_SLICES, EXTRA_SLICES_LARGE = 16, 32
+#: Further code channels by layer, for slices. Rounding errors of the last level go straight into the colour, mostly
+#: from a few channels. The large network has more channels there.
+EXTRA_SLICES = dict.fromkeys(("dec_conv1a", "dec_conv1b"), 16)
+EXTRA_SLICES_LARGE = dict.fromkeys(EXTRA_SLICES, 32)
+#: Those of the denoiser of one render at full size, which sees less noise, so that its rounding shows.
+OWN_SLICES = {"enc_conv1a": 16, "enc_conv1b": 32, "dec_conv2b": 32, "dec_conv1a": 48, "dec_conv1b": 48}
+#: Power of the rounding error of a weight after the other weights of its row have made up for it, as a share of that
+#: before; and mean square of a code.
+COMPENSATED, CODE_POWER = 0.3, 40.0**2
+#: Weights that are rounded before the ones behind them make up for it; a block at a time is faster.
+BLOCK = 128
 #: Convolutions that read a layer of the U-Net but are no part of it. Their outputs, and the last layer's outputs after
 #: the colours, are logits and logarithms: signed, in [-SIGNED_RANGE, SIGNED_RANGE], with SIGNED_ZERO as the code of 0.
 HEADS = ("head1", "head2", "head3")
@@ -143,13 +150,15 @@ class Fit:
         weights: of its convolutions and of the heads.
         slices_out: slices of the output colour.
         extra_slices: see ``EXTRA_SLICES``, which holds if None.
+        headroom: see ``HEADROOM``.
         layers: the result.
     """
 
     shape: Shape
     weights: Weights
     slices_out: int = OUTPUT_SLICES
-    extra_slices: int | None = None
+    extra_slices: Mapping[str, int] | None = None
+    headroom: float = HEADROOM
     layers: dict[str, QuantisedConv] = field(default_factory=dict)
     _random: torch.Generator = field(default_factory=lambda: torch.Generator().manual_seed(0))
 
@@ -157,17 +166,19 @@ class Fit:
         """Quantise a convolution; return its outputs."""
         weights, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
         rectified = self._rectified(name, len(bias))
-        patches, outputs, exact = [], [], []
+        exact, power, products = [], torch.zeros((), dtype=torch.double), torch.zeros((), dtype=torch.double)
         for image, codes in zip(inputs.exact, inputs.codes, strict=True):
             result = F.conv2d(image, weights, bias, padding=1)
             pixels = torch.randperm(result[0, 0].numel(), generator=self._random)[:PIXELS]
-            patches.append(_patches(codes, pixels))
-            outputs.append(result[0].flatten(1)[:, pixels].T)
+            patches = _patches(codes, pixels)
+            power = power + (patches.T @ patches).double() / len(patches)
+            products = products + (patches.T @ result[0].flatten(1)[:, pixels].T).double() / len(patches)
             result[:, :rectified].relu_()
             exact.append(result)
         of_codes = weights[:, inputs.layout.source_channel] * inputs.layout.scale[:, None, None]
         original = torch.cat([of_codes.flatten(1), bias[:, None]], dim=1)
-        chosen, step, bias = gptq(torch.cat(patches), torch.cat(outputs), original)
+        count = len(exact)
+        chosen, step, bias = gptq(power / count, products / count, count * len(pixels), original)
         layout, offset = self._output_layout(name, exact, rectified)
         layer = QuantisedConv(chosen.reshape(of_codes.shape), step, bias, inputs.layout, layout, offset)
         self.layers[name] = layer
@@ -179,17 +190,31 @@ class Fit:
             return 0
         return COLOURS if name == self.shape.last else count
 
-    def _noise_gain(self, name: str) -> Tensor:
-        """Return the power of noise in the colours per power of noise in each channel of a last-level layer.
+    def _extra_slices(self, name: str) -> int:
+        usual = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
+        return (usual if self.extra_slices is None else self.extra_slices).get(name, 0)
 
-        ReLUs are ignored.
+    def _noise_gain(self, name: str) -> Tensor:
+        """Return the power of noise in the colours per power of noise in each output of a convolution.
+
+        ReLUs are ignored. Above the last level, all outputs count alike.
         """
-        level = self.shape.up[-1]
-        result = torch.zeros(len(self.weights[f"{self.shape.last}.bias"]))
-        result[:COLOURS] = 1
-        for reader in (self.shape.last, *level[: level.index(name) : -1]):
+        level = [*self.shape.up[-1], self.shape.last]
+        if name not in level:
+            return torch.ones(len(self.weights[f"{name}.bias"]))
+        result = (torch.arange(len(self.weights[f"{self.shape.last}.bias"])) < COLOURS).float()
+        for reader in level[: level.index(name) : -1]:
             result = result @ self.weights[f"{reader}.weight"].square().sum(dim=(2, 3))
         return result
+
+    def _slices(self, name: str, tops: Tensor) -> Tensor:
+        """Return the number of slices of each output of a convolution, given the largest values (C,)."""
+        extra, order = self._extra_slices(name), self.shape.order
+        if not extra:
+            return torch.ones(len(tops), dtype=torch.long)
+        reader = order[order.index(name) + 1]
+        weights = self.weights[f"{reader}.weight"][:, : len(tops)]
+        return slices_per_channel(tops, weights, self._noise_gain(reader), extra)
 
     def _output_layout(self, name: str, exact: list[Tensor], rectified: int) -> tuple[CodeLayout, Tensor]:
         """Return the layout of a layer's output codes, and the value at which each code channel's slice starts."""
@@ -198,15 +223,11 @@ class Fit:
             tops, slices = torch.ones(rectified), torch.full((rectified,), self.slices_out)
         else:
             below = any(name in level for level in self.shape.up[:-1])
-            share, headroom = (1.0, HEADROOM) if below else (COVERED, 1.0)
+            share, headroom = (1.0, self.headroom) if below else (COVERED, 1.0)
             tops = headroom * torch.stack([_quantile(image[0].flatten(1), share) for image in exact]).amax(dim=0)
             tops = tops.clamp_min(1e-3 * tops.max())
             tops = tops**OWN_RANGE * tops.max() ** (1 - OWN_RANGE)
-            slices = torch.ones(rectified, dtype=torch.long)
-            if name in self.shape.up[-1]:
-                usual = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
-                extra = usual if self.extra_slices is None else self.extra_slices
-                slices = slices_per_channel(self._noise_gain(name) * tops**2, extra)
+            slices = self._slices(name, tops)
         # The first slice of every channel, then the second slice of those that have one, ...
         nth, source = (torch.arange(int(slices.sum()))[:, None] < slices).nonzero(as_tuple=True)
         width = (tops / slices)[source]
@@ -220,16 +241,31 @@ class Fit:
         return CodeLayout(scale, source), offset
 
 
-def slices_per_channel(noise: Tensor, extra: int) -> Tensor:
-    """Distribute ``extra`` slices, beyond one per channel, for the least total noise.
+def slices_per_channel(tops: Tensor, weights: Tensor, gain: Tensor, extra: int) -> Tensor:
+    """Distribute ``extra`` slices, beyond one per channel, for the least noise.
+
+    n slices divide the rounding error of a channel by n, and also the weights that read it. The largest weight of a row
+    decides how finely all others are rounded, so slices of the channel that it reads make the whole row finer.
 
     Args:
-        noise: (C,), each channel's noise with one slice; n slices divide it by n².
+        tops: (C,), the largest value of each channel.
+        weights: (R, C, 3, 3), of the convolution that reads them.
+        gain: (R,), the power of noise that counts per power of noise in each output of this convolution.
     """
-    slices = torch.ones(len(noise), dtype=torch.long)
+    rounding = gain @ weights.square().sum(dim=(2, 3)) * (tops / 255).square()
+    largest = weights.abs().amax(dim=(2, 3)) * tops / 255
+    codes = COMPENSATED * CODE_POWER * 9 * len(tops)
+
+    def noise(slices: Tensor) -> Tensor:
+        # A mean of high powers: if two weights are the largest, slices of either are the first half of the way
+        step = (largest / slices[:, None]).pow(12).sum(dim=-1).pow(1 / 12) / MAX_WEIGHT
+        return (rounding / slices.square()).sum(dim=-1) + codes * step.square() @ gain
+
+    slices = torch.ones(len(tops))
     for _ in range(extra):
-        slices[(noise * (1 / slices**2 - 1 / (slices + 1) ** 2)).argmax()] += 1
-    return slices
+        candidates = slices + torch.eye(len(slices))
+        slices = candidates[noise(candidates).argmin()]
+    return slices.long()
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:
@@ -238,34 +274,37 @@ def _quantile(values: Tensor, share: float) -> Tensor:
 
 
 def _patches(image: Tensor, pixels: Tensor) -> Tensor:
-    """Return the 3 x 3 neighbourhoods of pixels of an image (1, C, H, W): (P, 9 C), ordered as a kernel's weights."""
+    """Return the 3 x 3 neighbourhoods of pixels of an image (1, C, H, W), ordered as a kernel's weights, and a 1.
+
+    The shape is (P, 9 C + 1).
+    """
     width = image.shape[3]
-    padded, rows, columns = F.pad(image[0], (1, 1, 1, 1)), pixels // width, pixels % width
-    parts = [padded[:, rows + y, columns + x] for y in range(3) for x in range(3)]
-    return torch.stack(parts, dim=1).flatten(0, 1).T
+    padded = F.pad(image[0], (1, 1, 1, 1)).permute(1, 2, 0).flatten(0, 1).contiguous()
+    first = pixels // width * (width + 2) + pixels % width
+    parts = [padded.index_select(0, first + y * (width + 2) + x) for y in range(3) for x in range(3)]
+    return torch.cat([torch.stack(parts, dim=2).flatten(1), torch.ones(len(pixels), 1)], dim=1)
 
 
-def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def gptq(power: Tensor, products: Tensor, pixels: int, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Choose integer weights in [-MAX_WEIGHT, MAX_WEIGHT] and their steps, so that inputs give outputs.
 
     Channels 2 i and 2 i + 1 are a pair: at each of the 3 x 3 pixels, their weights of one sign sum to ``MAX_PAIR`` at
     most.
 
     Args:
-        inputs: (P, K), 3 x 3 pixels of each of an even number of channels.
-        outputs: (P, O).
+        power: (K + 1, K + 1), mean products of the inputs: 3 x 3 pixels of each of an even number of channels, and a 1.
+        products: (K + 1, O), mean products of inputs and outputs.
+        pixels: whose means these are.
         weights: (O, K + 1), the original weights; bias last.
 
     Returns:
         Integers (O, K), the step of each row (O,), bias (O,).
     """
-    count = inputs.shape[1]
-    x = torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1).double()
-    power = x.T @ x / len(x)
-    damping = torch.diag(DAMPING * count / len(x) * power.diagonal() + 1e-6 * power.diagonal().mean())
+    count = len(power) - 1
+    damping = torch.diag(DAMPING * count / pixels * power.diagonal() + 1e-6 * power.diagonal().mean())
     damping[count, count] = 1e-9
     original = weights.double()
-    weights = torch.linalg.solve(power + damping, x.T @ outputs.double() / len(x) + damping @ original.T).T
+    weights = torch.linalg.solve(power + damping, products + damping @ original.T).T
     pairs = torch.stack([weights, -weights])[:, :, :count].clamp_min(0).reshape(2, len(weights), -1, 2, 9).sum(dim=3)
     # Bounded, so that biases in steps fit into 32 bits
     step = (pairs.amax(dim=(0, 2, 3)) / MAX_PAIR).maximum(weights[:, :count].abs().amax(dim=1) / MAX_WEIGHT)
@@ -277,13 +316,17 @@ def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Tensor, Tens
     rest, chosen = weights[:, order].clone(), torch.zeros(len(weights), count, dtype=torch.double)
     channel, pixel = torch.arange(count) // 9, torch.arange(count) % 9
     beside = (channel ^ 1) * 9 + pixel
-    for i in range(count):
-        partner = chosen[:, beside[order[i]]]
-        largest = (MAX_PAIR - partner.clamp_min(0)).clamp_max(MAX_WEIGHT)
-        smallest = (-MAX_PAIR - partner.clamp_max(0)).clamp_min(-MAX_WEIGHT)
-        chosen[:, order[i]] = (rest[:, i] / step).round().clamp(smallest, largest)
-        error = (rest[:, i] - chosen[:, order[i]] * step) / upper[i, i]
-        rest[:, i:] -= error[:, None] * upper[i, i:]
+    for start in range(0, count, BLOCK):
+        stop = min(start + BLOCK, count)
+        errors = torch.zeros(len(weights), stop - start, dtype=torch.double)
+        for i in range(start, stop):
+            partner = chosen[:, beside[order[i]]]
+            largest = (MAX_PAIR - partner.clamp_min(0)).clamp_max(MAX_WEIGHT)
+            smallest = (-MAX_PAIR - partner.clamp_max(0)).clamp_min(-MAX_WEIGHT)
+            chosen[:, order[i]] = (rest[:, i] / step).round().clamp(smallest, largest)
+            errors[:, i - start] = (rest[:, i] - chosen[:, order[i]] * step) / upper[i, i]
+            rest[:, i:stop] -= errors[:, i - start, None] * upper[i, i:stop]
+        rest[:, stop:] -= errors @ upper[start:stop, stop:]
     return chosen.float(), step.float(), rest[:, count].float()
 
 
@@ -306,6 +349,21 @@ def run_unet_on_activations(
     with torch.no_grad():
         pool = functools.partial(changed, functools.partial(F.max_pool2d, kernel_size=2))
         return run_unet(shape, inputs, conv, pool, functools.partial(changed, lambda image: upsample(image, 2)), concat)
+
+
+def quantise_own_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor]) -> Fit:
+    """Quantise the denoiser of one render at full size.
+
+    Args:
+        shape, weights: as for :func:`quantise_mean_denoiser`.
+        codes: inputs of the network, see :func:`research.training.quantise.codes.own_codes`.
+    """
+    normals = CodeLayout(torch.full((3,), 1 / 255), torch.arange(6, 9))
+    layout = concatenated(sliced_layout(INPUT_SLICES, 0), sliced_layout(INPUT_SLICES, 3), normals)
+    # Its values are those of the calibration: unlike the mean of two renders of few spp, it has no rare light
+    fit = Fit(shape, weights, extra_slices=OWN_SLICES, headroom=1.0)
+    run_unet_on_activations(shape, [activations(codes, layout)], fit.conv)
+    return fit
 
 
 def quantise_mean_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor]) -> Fit:

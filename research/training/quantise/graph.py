@@ -17,7 +17,6 @@ from onnx import TensorProto, compose, helper, numpy_helper
 from oiio_msspl.model.encoding import MAX_RADIANCE
 from research.training.encoding import log_decode, log_encode, pu_encode
 from research.training.oidn import run_unet
-from research.training.quantise.codes import INPUT_CHANNELS
 from research.training.quantise.gptq import COLOURS, Fit
 from research.training.tracing import IR_VERSION, OPSET
 
@@ -149,9 +148,10 @@ class Graph(Nodes):
     def model(self) -> onnx.ModelProto:
         """Return the graph of a network that denoises."""
         self.colours(["layers"], "codes")
+        channels = len(self.fit.layers[self.fit.shape.order[0]].inputs.scale)
         return self.finished(
             "oidn",
-            [helper.make_tensor_value_info("layers", TensorProto.UINT8, [1, "h", "w", INPUT_CHANNELS])],
+            [helper.make_tensor_value_info("layers", TensorProto.UINT8, [1, "h", "w", channels])],
             [helper.make_tensor_value_info("codes", TensorProto.INT32, [1, "h", "w", 3])],
         )
 

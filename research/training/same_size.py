@@ -7,12 +7,12 @@ This writes ``joint-x1.onnx`` beside the file for CPUs and, in the folder `gpu`,
 trained: the networks and their weights are those of the model at x2, and only what comes before them changes. The mean
 of both renders takes the place of the HRLS, and the mean at half of the size that of the LRHS.
 
-With ``--clean``, it also writes the models for renders with little noise. ``joint-clean-x1.onnx`` is the denoiser of
-that mean alone, at full size. That of ``joint-large`` reads albedo and normal that are denoised before.
-``joint-clean-x2.onnx`` and those at x4 and x8 denoise the HRLS by it, and the mean of both renders at the LRHS's size
-as the models do that they are made of. Then they draw the first picture towards the brightness of the second. Noise
-that a filter has spread needs the whole model for one render, so ``joint-spread-clean-x2.onnx`` holds it, and there is
-no ``joint-spread-clean-x1.onnx``.
+With ``--clean``, it also writes the models for renders with little noise. ``joint-clean-x1.onnx`` is Open Image
+Denoise's large network, which denoises the mean at full size. That of ``joint-large`` reads albedo and normal that are
+denoised before. ``joint-clean-x2.onnx`` and those at x4 and x8 denoise the HRLS by it, and the mean of both renders at
+the LRHS's size as the models do that they are made of. Then they draw the first picture towards the brightness of the
+second. Noise that a filter has spread needs the whole model for one render, so ``joint-spread-clean-x2.onnx`` holds it,
+and there is no ``joint-spread-clean-x1.onnx``.
 
 Run :mod:`research.training.share` afterwards, so that the weights lie once.
 """
@@ -20,7 +20,6 @@ Run :mod:`research.training.share` afterwards, so that the weights lie once.
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,21 +31,24 @@ from onnx import helper
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.aovs.features import RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.model.contract import CLEAN, METADATA_KEY, ONE_SIZE, SCALES, SPREAD, Contract
-from oiio_msspl.model.devices import gpu_file
+from oiio_msspl.model.devices import GPU_FOLDER, gpu_file
+from research.training.denoisers import OwnDenoiser
 from research.training.encoding import log_decode, log_encode
+from research.training.gpu import denoiser_graph, in_half_floats
 from research.training.joint import MAX_RATIO
 from research.training.ops import box_downsample, upsample
+from research.training.quantise.codes import INPUT_SLICES
 from research.training.quantise.graph import Nodes
-from research.training.render_mean import NOISE_GAIN, Images, mean_of_renders
+from research.training.render_mean import Images, mean_of_renders
 from research.training.tracing import traced
-from research.training.whole_model import ENTER, Enter, encoded, example, inputs_of
+from research.training.whole_model import ENTER, OWN_DENOISER, Enter, add_quantised, encoded, example, inputs_of
 
 #: What comes out of :class:`EnterHalves` and of :class:`EnterMean`; ``encoded.`` precedes these names in the graph.
 HALVES = ("lrhs", "hrls", "colour", "noise", "albedo", "normal")
-MEAN = ("hrls", "colour", "noise", "albedo", "normal")
-#: Peak memory of a tile in bytes for each of its pixels, if the denoiser of the mean runs at full size.
+MEAN = ("hrls", "colour", "albedo", "normal")
+#: Peak memory of a tile in bytes for each of its pixels, if a large denoiser runs at full size.
 BYTES_PER_PIXEL = 1160
 #: Height and width at x2 of a pixel of the LRHS.
 SCALE = 2
@@ -56,7 +58,7 @@ SCALE = 2
 DRAWN, DRAWN_SPREAD = (0.2, 0.8), (0.0, 0.3)
 #: Added to both sides of the ratio of their brightness, in exposed radiance: noise in the dark is no light.
 DARK = 0.02
-#: Prefix of tensors of the denoiser at full size, in the graph of a model for pairs with little noise.
+#: Prefix of tensors of the denoiser at full size.
 OWN = "own."
 
 
@@ -81,21 +83,12 @@ class EnterHalves(Enter):
 
 
 class EnterMean(Enter):
-    """What comes before the denoiser of both renders' mean, if it is the whole model.
-
-    The noise of one render is estimated from how far each pixel is from the mean of its four diagonal neighbours. If
-    they show the same, this difference has 5/4 of the pixel's variance.
-    """
+    """What comes before the denoiser of one render, or of the mean of two of one size, if it is the whole model."""
 
     def forward(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return the values of ``MEAN``."""
-        lrhs, hrls, shares = self.exposed(inputs)
-        colour, noise, *aovs = mean_of_renders(lrhs, hrls, shares)
-        around = F.pad(colour, (1, 1, 1, 1), mode="replicate")
-        diagonal = (around[..., :-2, :-2] + around[..., :-2, 2:] + around[..., 2:, :-2] + around[..., 2:, 2:]) / 4
-        of_one = NOISE_GAIN * math.sqrt(4 / 5) * (colour - diagonal).abs().mean(dim=1, keepdim=True)
-        noise = torch.where(shares[RGB] == 0, of_one.clamp_max(1.0), noise)
-        return encoded(_mean(lrhs, hrls, shares)), colour, noise, *aovs
+        """Return the values of ``MEAN``. Albedo and normal are in [0, 1]."""
+        mean = _mean(*self.exposed(inputs))
+        return encoded(mean), log_encode(mean[RGB]), mean[ALBEDO].clamp(0, 1), 0.5 * mean[NORMAL] + 0.5
 
 
 class Draw(nn.Module):
@@ -149,12 +142,32 @@ def same_size_model(path: Path, clean: bool) -> onnx.ModelProto:
         ENTER, {name: f"encoded.{name}" for name in names},
     )  # fmt: skip
     outputs = list(model.graph.output)
-    if clean:
-        _keep_denoiser(model.graph, graph)
-        outputs = [value for value in outputs if value.name != "log_error"]
     made = {f"encoded.{name}" for name in names}
-    nodes = [n for n in model.graph.node if not n.output[0].startswith(ENTER) and n.output[0] not in made]
+    if clean:
+        denoised = {value.name for value in outputs}
+        images = [name if name in denoised else f"encoded.{name}" for name in MEAN[1:]]
+        add_own_denoiser(graph, images, "encoded.fused", half_floats=path.parent.name == GPU_FOLDER)
+        outputs, made = [value for value in outputs if value.name != "log_error"], made | {"encoded.fused"}
+    nodes = [n for n in model.graph.node if not n.output[0].startswith(ENTER) and made.isdisjoint(n.output)]
     return _finished(model, contract, graph, nodes, outputs)
+
+
+def add_own_denoiser(graph: Nodes, images: list[str], output: str, *, half_floats: bool) -> None:
+    """Add the denoiser of one render to a graph, in 8 bits or in half floats.
+
+    Args:
+        images: tensors of colour, albedo and normal, as :class:`research.training.denoisers.OwnDenoiser` reads them.
+        output: tensor of the denoised picture, log-encoded.
+    """
+    if half_floats:
+        names = dict(zip(MEAN[1:], images, strict=True))
+        graph.embed(denoiser_graph(in_half_floats(OwnDenoiser()), MEAN[1:]), OWN, names | {"denoised": output})
+        return
+    colour, albedo, normal = images
+    step = graph.constant("step", np.float32(1 / 255))
+    codes = [code for image in (graph.log_to_pu(colour), albedo) for code in graph.slices(image, INPUT_SLICES)]
+    codes += [graph.add("QuantizeLinear", [normal, step, "zero"], f"{normal}.codes"), *3 * [graph.zeros(normal)]]
+    add_quantised(graph, onnx.load(OWN_DENOISER), OWN, graph.packed(codes, "own.layers"), output)
 
 
 def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:
@@ -180,8 +193,7 @@ def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:
     images = tuple(inputs_of_draw[name] for name in ("lrhs.rgb", "hrls.rgb", "share.rgb"))
     spread = family.endswith(SPREAD)
     draw = traced(Draw(contract.scale, spread), images, ["mean", "hrls", "share"], ["drawn"], contract.alignment)
-    own = f"{OWN}{'encoded.fused' if spread else 'mean.denoised'}"
-    names = {"mean": "mean.denoised", "hrls": own, "share": "share.rgb", "drawn": "encoded.fused"}
+    names = {"mean": "mean.denoised", "hrls": f"{OWN}encoded.fused", "share": "share.rgb", "drawn": "encoded.fused"}
     graph.embed(draw, "draw.", names)
     outputs = [value for value in model.graph.output if value.name != "log_error"]
     made = {name for node in graph.nodes for name in node.output}
@@ -199,17 +211,6 @@ def _finished(
     model.graph.CopyFrom(helper.make_graph(nodes, contract.name, inputs_of(contract), outputs, tensors))
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     return model
-
-
-def _keep_denoiser(model: onnx.GraphProto, graph: Nodes) -> None:
-    """Let the denoiser of the mean give the result, and read the denoised albedo and normal if there are any."""
-    instead = {"encoded.fused": "mean.denoised"}
-    if "normal" in (value.name for value in model.output):
-        two, one = graph.constant("two", np.float32(2)), graph.constant("unity", np.float32(1))
-        signed = graph.add("Sub", [graph.add("Mul", ["normal", two], "normal.doubled"), one], "normal.signed")
-        instead |= {"encoded.albedo": "albedo", "encoded.normal": signed}
-    for node in model.node:
-        node.input[:] = [instead.get(name, name) for name in node.input]
 
 
 def _needed(

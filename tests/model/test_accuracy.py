@@ -15,14 +15,14 @@ from oiio_msspl.model.contract import ONE_SIZE
 
 #: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``, whose HRLS has 2 spp.
 SCORES = {
-    "joint-clean-x1": (22.73, 0.0296),
-    "joint-clean-x2": (23.21, 0.0281),
-    "joint-clean-x4": (22.90, 0.0296),
-    "joint-clean-x8": (22.70, 0.0304),
-    "joint-large-clean-x1": (24.38, 0.0243),
-    "joint-large-clean-x2": (24.81, 0.0251),
-    "joint-large-clean-x4": (24.54, 0.0260),
-    "joint-large-clean-x8": (24.35, 0.0257),
+    "joint-clean-x1": (22.43, 0.0331),
+    "joint-clean-x2": (22.89, 0.0308),
+    "joint-clean-x4": (22.59, 0.0325),
+    "joint-clean-x8": (22.40, 0.0332),
+    "joint-large-clean-x1": (24.41, 0.0239),
+    "joint-large-clean-x2": (24.82, 0.0247),
+    "joint-large-clean-x4": (24.54, 0.0256),
+    "joint-large-clean-x8": (24.33, 0.0255),
     "joint-large-spread-clean-x2": (24.09, 0.0273),
     "joint-large-spread-clean-x4": (24.06, 0.0272),
     "joint-large-spread-clean-x8": (24.10, 0.0267),

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch")
+pytest.importorskip("pyoidn")
 
 import onnx
 import torch

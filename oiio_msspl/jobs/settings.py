@@ -161,9 +161,10 @@ def family_for_noise(
     spread, scale = is_noise_spread(lr, hr, alignment), alignment.scale
     kind = SPREAD if spread else ""
     clean = None if error else for_little_noise(family + kind, scale)
-    if clean and has_little_noise(lr, hr, alignment, spread=bool(spread)):
-        denoises_aovs = spread or (family == QUALITIES["best"] and scale == ONE_SIZE)
-        if denoises_aovs or has_clean_aovs(hr, alignment, CLEAN_AOVS if scale == ONE_SIZE else CLEAN_AOVS_OF_PAIR):
+    denoises_aovs = family == QUALITIES["best"] and scale == ONE_SIZE
+    if clean and has_little_noise(lr, hr, alignment, spread=bool(spread), denoises_aovs=denoises_aovs):
+        least = CLEAN_AOVS if scale == ONE_SIZE else CLEAN_AOVS_OF_PAIR
+        if spread or denoises_aovs or has_clean_aovs(hr, alignment, least):
             return clean, kind + CLEAN
     return family + kind, None if spread is None else kind
 

@@ -25,8 +25,10 @@ from oiio_msspl.model.encoding import encode_radiance, find_exposure
 from oiio_msspl.model.render_mean import lrhs_share
 
 #: Standard deviation of the noise in blocks, log-encoded, and the share of the blocks with less: the others may have
-#: texture. Path-traced rooms have this noise at some 16 to 32 spp.
-LITTLE, SMOOTH = 0.07, 0.25
+#: texture. Path-traced rooms have this noise at some 8 to 32 spp.
+LITTLE, SMOOTH = 0.085, 0.25
+#: The limit for a model that denoises albedo and normal before. Rooms have this noise at some 4 to 16 spp.
+LITTLE_WITH_CLEAN_AOVS = 0.12
 #: The limit for pairs of two sizes, by scale. Their difference is free of texture. The larger the pixels of the LRHS,
 #: the more detail the models for more noise lose, so the limit grows.
 LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
@@ -39,14 +41,22 @@ EDGES, CLEAN_AOVS = 1e-4, 0.46
 CLEAN_AOVS_OF_PAIR = 0.42
 
 
-def has_little_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, spread: bool = False) -> bool:
+def has_little_noise(
+    lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, spread: bool = False, denoises_aovs: bool = False
+) -> bool:
     """Return whether an HRLS has little noise, or the mean of two renders of one size; one render is given as both.
 
-    Small samples all over the frame are read. ``spread``: a filter has spread the noise over neighbouring pixels.
+    Small samples all over the frame are read.
+
+    Args:
+        lr, hr, alignment: of the pair.
+        spread: a filter has spread the noise over neighbouring pixels.
+        denoises_aovs: the model for little noise denoises albedo and normal before.
     """
     scale = alignment.scale
     if spread or scale == ONE_SIZE:
-        limit, found = (LITTLE_SPREAD * scale if spread else LITTLE), _noise_in_blocks(lr, hr, alignment)
+        of_one_size = LITTLE_WITH_CLEAN_AOVS if denoises_aovs else LITTLE
+        limit, found = (LITTLE_SPREAD * scale if spread else of_one_size), _noise_in_blocks(lr, hr, alignment)
     else:
         limit, found = LITTLE_OF_PAIR[scale], _noise_by_difference(lr, hr, alignment)
     return len(found) > 0 and bool(np.quantile(found, SMOOTH) < limit)

@@ -52,6 +52,13 @@ def test_only_best_takes_the_model_for_little_noise_if_aovs_are_noisy(samples):
         assert family_for_noise(family, hr, hr, align(hr, hr))[0] == family + "-clean" * clean
 
 
+@pytest.mark.parametrize(("light", "best", "balanced"), [(0.25, True, True), (0.35, True, False), (0.6, False, False)])
+def test_a_model_that_denoises_albedo_and_normal_before_is_taken_in_more_noise(light, best, balanced):
+    hr = render_of(checks(64), light)
+    for family, clean in (("joint-large", best), ("joint", balanced)):
+        assert family_for_noise(family, hr, hr, align(hr, hr))[0] == family + "-clean" * clean
+
+
 @pytest.mark.parametrize("scale", [2, 4])
 @pytest.mark.parametrize(("noise", "little"), [(0.03, True), (0.3, False)])
 def test_fine_texture_of_a_pair_is_no_noise(scale, noise, little):

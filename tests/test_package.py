@@ -8,7 +8,7 @@ from zipfile import ZipFile
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-LARGEST = 60e6
+LARGEST = 70e6
 
 
 def build(kind, folder):

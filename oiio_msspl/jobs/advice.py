@@ -10,13 +10,13 @@ from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.model.contract import ONE_SIZE
 
 #: PSNR in dB that one render has over two sizes with the same samples: the least and the most, for 2 to 128 spp.
-ONE_OVER_TWO_SIZES = 0.18, 1.3
+ONE_OVER_TWO_SIZES = 0.19, 1.53
 #: PSNR in dB that three quarters of 8 spp in the HRLS have over half of them.
 THREE_QUARTERS = 0.25
 #: PSNR in dB that neighbouring frames with motion vectors add, at x2.
 NEIGHBOURS = 2.66
 #: PSNR in dB of a lit display at 64 and 16 spp: without what both renders show, and with it.
-BOTH_SHOW = (17.6, 49.3)
+BOTH_SHOW = 17.6, 48.5
 #: PSNR in dB at 2 spp of noise that a wide pixel filter has spread: OIDN's, and ours.
 SPREAD_NOISE = (21.20, 32.39)
 #: From so many samples per pixel of the HRLS on, most samples belong there; the LRHS then has at most this share.

@@ -48,6 +48,27 @@ def test_tiles_of_one_render_do_not_show(monkeypatch):
     assert difference.max() < 0.02
 
 
+@pytest.mark.parametrize("colour", [(0, 10, 0), (200, 0, 0), (2000, 2000, 2000)])
+def test_a_visible_lamp_of_one_render_keeps_its_light(colour):
+    """Its pixels have no noise. Networks have no codes for light that is so bright or saturated."""
+    session = load_model(1, "fast", threads=1)
+    images = layers()
+    lamp = (slice(40, 70), slice(60, 100))
+    images["rgb"][lamp] = colour
+    render = Render.from_arrays("hr", **images)
+    np.testing.assert_array_equal(fuse(render, render, session).rgb[lamp], render.layers["rgb"][lamp])
+
+
+def test_a_bright_highlight_with_noise_is_denoised():
+    session = load_model(1, "fast", threads=1)
+    images = layers()
+    bright = (slice(40, 70), slice(60, 100))
+    images["rgb"][bright] = noisy(np.full((30, 40, 3), 12, np.float32), 16, 1)
+    render = Render.from_arrays("hr", **images)
+    inner = (slice(45, 65), slice(65, 95))
+    assert fuse(render, render, session).rgb[inner].std() < 0.4 * images["rgb"][inner].std()
+
+
 def test_the_share_of_two_renders_is_found_or_given():
     """A render with 64 times the samples of the other one decides the result."""
     session = load_model(1, "fast", threads=1)
@@ -120,7 +141,7 @@ def test_arrays_choose_their_model(sigma, monkeypatch):
     monkeypatch.setattr(
         arrays, "_session", lambda *given: chosen.append(given[:2]) or load_model(*given[:2], threads=1)
     )
-    images = layers()
+    images = layers(spp=1)
     images["rgb"] = spread(images["rgb"], sigma) if sigma else images["rgb"]
     second = noisy(picture(HEIGHT, WIDTH), 1, seed=5)
     second = spread(second, sigma) if sigma else second

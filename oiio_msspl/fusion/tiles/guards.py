@@ -32,6 +32,9 @@ NOISE_FREE = 1 / 512
 #: Exposed radiance above which light that both renders show is taken from the HRLS. Noise is hardly ever so bright in
 #: both. At a quarter of this, one of 38 rendered views has a firefly that would pass.
 LIGHT = 4096.0
+#: Exposed radiance above which a light without noise keeps the pixels of the only render. It has no noise if all of
+#: 3 x 3 pixels differ from the one in the middle by this share of it at most.
+STEADY_LIGHT, STEADY = 4.0, 0.02
 #: A surface becomes black if this many LRHS pixels around are black. Networks look as far.
 FAR = 15
 #: A surface becomes black in a pass if this many HRLS pixels around are black. Black passes are common, and a network
@@ -111,6 +114,30 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
     for_row_blocks(work, len(hrls_rgb), hrls_rgb[0].size, multiple=scale)
     agreed[np.all(agreed <= least, axis=-1)] = 0
     return agreed
+
+
+def steady_lights(rgb: Array, exposure: float) -> Array | None:
+    """Return the colour of bright areas of a render (h, w, 3) that have no noise, such as lamps and windows.
+
+    Networks in 8 bits have no codes for very bright or saturated light, and it loses most of its energy. Two renders
+    tell what is missing, one render does not. Without noise, there is nothing to remove.
+
+    Returns:
+        (h, w, 3), scene linear; 0 elsewhere. None if there is no such area.
+    """
+    brightest = reduce(np.maximum, (rgb[..., channel] for channel in range(3)))
+    least = np.float32(STEADY_LIGHT / exposure)
+    rows, columns = np.nonzero(brightest > least)
+    if not rows.size:
+        return None
+    padded = np.pad(rgb, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    own, limit = rgb[rows, columns], np.float32(STEADY) * brightest[rows, columns, None]
+    with np.errstate(over="ignore"):
+        around = (padded[rows + y, columns + x] for y, x in np.ndindex(3, 3))
+        alike = reduce(np.logical_and, ((np.abs(pixels - own) <= limit).all(axis=1) for pixels in around))
+    steady = np.zeros(brightest.shape, dtype=bool)
+    steady[rows, columns] = alike
+    return rgb * grown(steady)[..., None] if alike.any() else None
 
 
 def _brightness_limit(rgb: Array, tile: TileFeatures) -> Array:

@@ -12,7 +12,15 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, read_lrhs, read_tile
-from oiio_msspl.fusion.tiles.guards import FAR, EmptyRegions, bright_lights, dim_fireflies, is_noise_free, lit_window
+from oiio_msspl.fusion.tiles.guards import (
+    FAR,
+    EmptyRegions,
+    bright_lights,
+    dim_fireflies,
+    is_noise_free,
+    lit_window,
+    steady_lights,
+)
 from oiio_msspl.fusion.tiles.tiling import Tile, aligned_grid, plan_tiles, sample_bands
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.model.contract import ONE_SIZE, Contract
@@ -32,7 +40,8 @@ class PreparedTile:
     """Inputs of the model; None for a tile that is empty everywhere."""
     hrls: Images | None = None
     lights: Array | None = None
-    """Pixels that keep the colour of the HRLS, see :func:`oiio_msspl.fusion.tiles.guards.bright_lights`."""
+    """Pixels that keep the colour of the HRLS, see :func:`oiio_msspl.fusion.tiles.guards.bright_lights`, or that of the
+    only render, see :func:`oiio_msspl.fusion.tiles.guards.steady_lights`."""
     noise_free: bool = False
     """The renders agree, so the HRLS is the result."""
     aovs: tuple[str, ...] = ()
@@ -104,6 +113,10 @@ class FramePair:
             lrhs_rgb, prepared.hrls = dim_fireflies(features)
             prepared.lrhs = features.lrhs | {RGB: lrhs_rgb}
             prepared.lights = bright_lights(lrhs_rgb, prepared.hrls[RGB], self.exposure)
+            steady = steady_lights(prepared.hrls[RGB], self.exposure) if self._is_one_render else None
+            if steady is not None:
+                lights = steady if prepared.lights is None else prepared.lights
+                prepared.lights = np.where(steady.any(axis=-1, keepdims=True), steady, lights)
             prepared.noise_free = not self._is_one_render and is_noise_free(
                 features, lrhs_rgb, prepared.hrls[RGB], self.exposure
             )

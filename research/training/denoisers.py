@@ -48,7 +48,7 @@ class MeanDenoiser(oidn.FineTunedUNet):
         return pu_to_log(colour.clamp_max(1.0))
 
 
-class OwnDenoiser(oidn.FineTunedUNet):
+class FullSizeDenoiser(oidn.FineTunedUNet):
     """Open Image Denoise's large network as it is, which denoises one render at full size."""
 
     def __init__(self) -> None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -39,6 +39,8 @@ from research.training.oidn import FineTunedUNet
 from research.training.tracing import network_example, prepend, traced
 from research.training.whole_model import SMALL, save, whole_model
 
+#: Inputs of the denoiser of both renders' mean, see :func:`research.training.render_mean.mean_of_renders`.
+MEAN_CHANNELS = {"colour": 3, "noise": 1, "albedo": 3, "normal": 3}
 #: What is added to the provenance of a file.
 PRECISION = {"precision": "convolutions in half floats, their weights stored in 8 bits with a scale for each kernel"}
 
@@ -86,15 +88,15 @@ def to_onnx(network: JointFusion, contract: Contract, denoiser: MeanDenoiser) ->
     graph = traced(Fuse(network), inputs, ["lrhs", "hrls"], outputs, contract.alignment)
     _store_kernels_in_8_bits(graph.graph)
     contract = replace(contract, provenance=contract.provenance | PRECISION)
-    model = whole_model(graph, contract, denoiser_graph(denoiser, ("colour", "noise", "albedo", "normal")))
+    model = whole_model(graph, contract, denoiser_graph(denoiser, MEAN_CHANNELS))
     onnx.checker.check_model(model, full_check=True)
     return model
 
 
-def denoiser_graph(network: FineTunedUNet, names: Sequence[str]) -> onnx.ModelProto:
-    """Export a denoiser, whose inputs are images of these names."""
-    images = tuple(torch.rand(1, 1 if name == "noise" else 3, 4 * ALIGNMENT, 6 * ALIGNMENT) for name in names)
-    model = traced(network, images, list(names), ["denoised"], ALIGNMENT)
+def denoiser_graph(network: FineTunedUNet, channels: Mapping[str, int]) -> onnx.ModelProto:
+    """Export a denoiser, whose inputs are images with these names and numbers of channels."""
+    images = tuple(torch.rand(1, count, 4 * ALIGNMENT, 6 * ALIGNMENT) for count in channels.values())
+    model = traced(network, images, list(channels), ["denoised"], ALIGNMENT)
     _store_kernels_in_8_bits(model.graph)
     return model
 

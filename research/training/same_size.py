@@ -34,7 +34,7 @@ from torch.nn import functional as F
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.model.contract import CLEAN, METADATA_KEY, ONE_SIZE, SCALES, SPREAD, Contract
 from oiio_msspl.model.devices import GPU_FOLDER, gpu_file
-from research.training.denoisers import OwnDenoiser
+from research.training.denoisers import FullSizeDenoiser
 from research.training.encoding import log_decode, log_encode
 from research.training.gpu import denoiser_graph, in_half_floats
 from research.training.joint import MAX_RATIO
@@ -43,7 +43,7 @@ from research.training.quantise.codes import INPUT_SLICES
 from research.training.quantise.graph import Nodes
 from research.training.render_mean import Images, mean_of_renders
 from research.training.tracing import traced
-from research.training.whole_model import ENTER, OWN_DENOISER, Enter, add_quantised, encoded, example, inputs_of
+from research.training.whole_model import ENTER, FULL_SIZE_DENOISER, Enter, add_quantised, encoded, example, inputs_of
 
 #: What comes out of :class:`EnterHalves` and of :class:`EnterMean`; ``encoded.`` precedes these names in the graph.
 HALVES = ("lrhs", "hrls", "colour", "noise", "albedo", "normal")
@@ -146,28 +146,33 @@ def same_size_model(path: Path, clean: bool) -> onnx.ModelProto:
     if clean:
         denoised = {value.name for value in outputs}
         images = [name if name in denoised else f"encoded.{name}" for name in MEAN[1:]]
-        add_own_denoiser(graph, images, "encoded.fused", half_floats=path.parent.name == GPU_FOLDER)
+        add_full_size_denoiser(graph, images, "encoded.fused", half_floats=path.parent.name == GPU_FOLDER)
         outputs, made = [value for value in outputs if value.name != "log_error"], made | {"encoded.fused"}
     nodes = [n for n in model.graph.node if not n.output[0].startswith(ENTER) and made.isdisjoint(n.output)]
     return _finished(model, contract, graph, nodes, outputs)
 
 
-def add_own_denoiser(graph: Nodes, images: list[str], output: str, *, half_floats: bool) -> None:
+def add_full_size_denoiser(graph: Nodes, images: list[str], output: str, *, half_floats: bool) -> None:
     """Add the denoiser of one render to a graph, in 8 bits or in half floats.
 
     Args:
-        images: tensors of colour, albedo and normal, as :class:`research.training.denoisers.OwnDenoiser` reads them.
+        images: tensors of colour, albedo and normal for :class:`research.training.denoisers.FullSizeDenoiser`.
         output: tensor of the denoised picture, log-encoded.
     """
     if half_floats:
         names = dict(zip(MEAN[1:], images, strict=True))
-        graph.embed(denoiser_graph(in_half_floats(OwnDenoiser()), MEAN[1:]), OWN, names | {"denoised": output})
+        graph.embed(
+            denoiser_graph(in_half_floats(FullSizeDenoiser()), dict.fromkeys(MEAN[1:], 3)),
+            OWN,
+            names | {"denoised": output},
+        )
         return
     colour, albedo, normal = images
     step = graph.constant("step", np.float32(1 / 255))
     codes = [code for image in (graph.log_to_pu(colour), albedo) for code in graph.slices(image, INPUT_SLICES)]
-    codes += [graph.add("QuantizeLinear", [normal, step, "zero"], f"{normal}.codes"), *3 * [graph.zeros(normal)]]
-    add_quantised(graph, onnx.load(OWN_DENOISER), OWN, graph.packed(codes, "own.layers"), output)
+    codes.append(graph.add("QuantizeLinear", [normal, step, "zero"], f"{normal}.codes"))
+    codes += -3 * len(codes) % 4 * [graph.zeros(normal)]
+    add_quantised(graph, onnx.load(FULL_SIZE_DENOISER), OWN, graph.packed(codes, "own.layers"), output)
 
 
 def clean_pair_model(path: Path, one_size: onnx.ModelProto) -> onnx.ModelProto:

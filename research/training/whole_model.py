@@ -35,7 +35,7 @@ from research.training.render_mean import Images, mean_of_renders
 from research.training.tracing import image_info, traced
 
 #: File of the denoiser of one render at full size, in 8 bits.
-OWN_DENOISER = CHECKPOINTS / "own_denoiser.onnx"
+FULL_SIZE_DENOISER = CHECKPOINTS / "full_size_denoiser.onnx"
 #: Prefixes of tensors in the graph of a model.
 ENTER, NETWORK, DENOISER = "enter.", "network.", "denoiser."
 #: Tensors of fewer bytes, such as biases, stay in the graph.

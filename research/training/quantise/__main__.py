@@ -2,10 +2,10 @@
 """Write a denoiser in 8 bits that is part of the models that ship: of both renders' mean, or of one render.
 
     python -m research.training.quantise VIEWS --checkpoint JOINT.pt --output mean_denoiser.onnx
-    python -m research.training.quantise VIEWS --own --output own_denoiser.onnx
+    python -m research.training.quantise VIEWS --full-size --output full_size_denoiser.onnx
 
-``--own`` is for Open Image Denoise's large network as it is, which denoises one render at full size. Prints how close
-the result is to the network in 32 bits.
+``--full-size`` is for Open Image Denoise's large network as it is, which denoises one render at full size. Prints how
+close the result is to the network in 32 bits.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from oiio_msspl.model.runtime import load_network
 from research.training import CHECKPOINTS
 from research.training.checkpoints import load_joint
 from research.training.data import Batches
-from research.training.denoisers import LayerDenoisers, OwnDenoiser, mean_images
+from research.training.denoisers import FullSizeDenoiser, LayerDenoisers, mean_images
 from research.training.encoding import log_decode, log_encode
 from research.training.oidn import FineTunedUNet, provenance
-from research.training.quantise.codes import OUTPUT_SLICES, denoiser_codes, log_encoded_of_code, own_codes
-from research.training.quantise.gptq import Fit, quantise_mean_denoiser, quantise_own_denoiser
+from research.training.quantise.codes import OUTPUT_SLICES, denoiser_codes, full_size_codes, log_encoded_of_code
+from research.training.quantise.gptq import Fit, quantise_full_size_denoiser, quantise_mean_denoiser
 from research.training.quantise.graph import Graph
 from research.training.quantise.layers import varied
 from research.training.render_mean import with_mean
-from research.training.whole_model import OWN_DENOISER, denoiser_file
+from research.training.whole_model import FULL_SIZE_DENOISER, denoiser_file
 
 CHECKPOINT = CHECKPOINTS / "joint.pt"
 #: Calibration images, and their width.
@@ -70,7 +70,7 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, help="folder of training views")
-    parser.add_argument("--own", action="store_true", help="the denoiser of one render")
+    parser.add_argument("--full-size", action="store_true", help="the denoiser of one render")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="of a joint network (default: the shipped)")
     parser.add_argument("-o", "--output", type=Path, help="file to write (default: the shipped)")
     args = parser.parse_args()
@@ -78,28 +78,25 @@ def main() -> None:
     images: Callable[[Path, str, int], Iterator[Images]]
     codes: Callable[..., Tensor]
     quantise: Callable[..., Fit]
-    if args.own:
-        exact, shipped, images = OwnDenoiser(), OWN_DENOISER, single_renders
-        codes, quantise = own_codes, quantise_own_denoiser
+    if args.full_size:
+        exact, shipped, images = FullSizeDenoiser(), FULL_SIZE_DENOISER, single_renders
+        codes, quantise = full_size_codes, quantise_full_size_denoiser
     else:
         joint, _ = load_joint(args.checkpoint)
-        exact, shipped, images = (
-            joint.mean_denoiser,
-            CHECKPOINTS / f"{denoiser_file(joint.denoiser(SCALES[0]))}.onnx",
-            means,
-        )
+        exact, images = joint.mean_denoiser, means
+        shipped = CHECKPOINTS / f"{denoiser_file(joint.denoiser(SCALES[0]))}.onnx"
         codes, quantise = denoiser_codes, quantise_mean_denoiser
     if exact is None:
         raise SystemExit(f"{args.checkpoint}: the size large has no denoiser of both renders' mean of its own")
-    fit = quantise(exact.shape, exact.weights(), [codes(*x) for x in images(args.views, "train", IMAGES)])
+    fit = quantise(exact.shape, exact.weights(), [codes(*inputs) for inputs in images(args.views, "train", IMAGES)])
     model, path = Graph(fit).model(), args.output or shipped
     helper.set_model_props(model, {"provenance": json.dumps(provenance(exact.network))})
     onnx.save(model, path)
     differences = []
-    for x in images(args.views, "validation", 24):
+    for inputs in images(args.views, "validation", 24):
         with torch.inference_mode():
-            expected = exact(*x)[0].permute(1, 2, 0).numpy()
-        differences.append(np.abs(run_denoiser(path, codes(*x)) - expected).mean())
+            expected = exact(*inputs)[0].permute(1, 2, 0).numpy()
+        differences.append(np.abs(run_denoiser(path, codes(*inputs)) - expected).mean())
     print(f"mean difference of encoded values {np.mean(differences):.4f}, at most {np.max(differences):.4f}")
 
 

@@ -21,8 +21,6 @@ from research.training.encoding import log_to_pu, pu_decode
 INPUT_SLICES, OUTPUT_SLICES = 3, 10
 #: Its input channels: three colours in slices, albedo, normal and noise.
 INPUT_CHANNELS = 3 * INPUT_SLICES + 7
-#: Those of the denoiser of one render: colour and albedo in slices, normal, and zeros up to a multiple of four.
-OWN_CHANNELS = 24
 
 
 def sliced(values: Tensor, count: int) -> Tensor:
@@ -41,19 +39,18 @@ def denoiser_codes(colour: Tensor, noise: Tensor, albedo: Tensor, normal: Tensor
     return torch.cat([slices, rest.mul(255).round().clamp(0, 255)], dim=1)
 
 
-def own_codes(colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-    """Quantise what the denoiser of one render reads, (N, 3, H, W) each, to (N, OWN_CHANNELS, H, W).
+def full_size_codes(colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+    """Quantise what the denoiser of one render reads, (N, 3, H, W) each, to (N, K, H, W).
 
-    A dark albedo is a few steps of 255, so it has slices, too.
+    A dark albedo is a few steps of 255, so it has slices, too. Zeros fill K up to a multiple of four.
 
     Args:
         colour: log-encoded.
         albedo, normal: in [0, 1].
     """
     slices = [sliced(image, INPUT_SLICES) for image in (log_to_pu(colour), albedo)]
-    return F.pad(
-        torch.cat([*slices, normal.mul(255).round()], dim=1), (0, 0, 0, 0, 0, OWN_CHANNELS - 6 * INPUT_SLICES - 3)
-    )
+    codes = torch.cat([*slices, normal.mul(255).round()], dim=1)
+    return F.pad(codes, (0, 0, 0, 0, 0, -codes.shape[1] % 4))
 
 
 @functools.cache

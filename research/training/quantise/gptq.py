@@ -48,7 +48,7 @@ MAX_PAIR = 128
 EXTRA_SLICES = dict.fromkeys(("dec_conv1a", "dec_conv1b"), 16)
 EXTRA_SLICES_LARGE = dict.fromkeys(EXTRA_SLICES, 32)
 #: Those of the denoiser of one render at full size, which sees less noise, so that its rounding shows.
-OWN_SLICES = {"enc_conv1a": 16, "enc_conv1b": 32, "dec_conv2b": 32, "dec_conv1a": 48, "dec_conv1b": 48}
+FULL_SIZE_SLICES = {"enc_conv1a": 16, "enc_conv1b": 32, "dec_conv2b": 32, "dec_conv1a": 48, "dec_conv1b": 48}
 #: Power of the rounding error of a weight after the other weights of its row have made up for it, as a share of that
 #: before; and mean square of a code.
 COMPENSATED, CODE_POWER = 0.3, 40.0**2
@@ -190,10 +190,6 @@ class Fit:
             return 0
         return COLOURS if name == self.shape.last else count
 
-    def _extra_slices(self, name: str) -> int:
-        usual = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
-        return (usual if self.extra_slices is None else self.extra_slices).get(name, 0)
-
     def _noise_gain(self, name: str) -> Tensor:
         """Return the power of noise in the colours per power of noise in each output of a convolution.
 
@@ -209,12 +205,13 @@ class Fit:
 
     def _slices(self, name: str, tops: Tensor) -> Tensor:
         """Return the number of slices of each output of a convolution, given the largest values (C,)."""
-        extra, order = self._extra_slices(name), self.shape.order
-        if not extra:
+        usual = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
+        extra, order = usual if self.extra_slices is None else self.extra_slices, self.shape.order
+        if name not in extra:
             return torch.ones(len(tops), dtype=torch.long)
         reader = order[order.index(name) + 1]
         weights = self.weights[f"{reader}.weight"][:, : len(tops)]
-        return slices_per_channel(tops, weights, self._noise_gain(reader), extra)
+        return slices_per_channel(tops, weights, self._noise_gain(reader), extra[name])
 
     def _output_layout(self, name: str, exact: list[Tensor], rectified: int) -> tuple[CodeLayout, Tensor]:
         """Return the layout of a layer's output codes, and the value at which each code channel's slice starts."""
@@ -351,17 +348,17 @@ def run_unet_on_activations(
         return run_unet(shape, inputs, conv, pool, functools.partial(changed, lambda image: upsample(image, 2)), concat)
 
 
-def quantise_own_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor]) -> Fit:
+def quantise_full_size_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor]) -> Fit:
     """Quantise the denoiser of one render at full size.
 
     Args:
         shape, weights: as for :func:`quantise_mean_denoiser`.
-        codes: inputs of the network, see :func:`research.training.quantise.codes.own_codes`.
+        codes: inputs of the network, see :func:`research.training.quantise.codes.full_size_codes`.
     """
     normals = CodeLayout(torch.full((3,), 1 / 255), torch.arange(6, 9))
     layout = concatenated(sliced_layout(INPUT_SLICES, 0), sliced_layout(INPUT_SLICES, 3), normals)
     # Its values are those of the calibration: unlike the mean of two renders of few spp, it has no rare light
-    fit = Fit(shape, weights, extra_slices=OWN_SLICES, headroom=1.0)
+    fit = Fit(shape, weights, extra_slices=FULL_SIZE_SLICES, headroom=1.0)
     run_unet_on_activations(shape, [activations(codes, layout)], fit.conv)
     return fit
 

@@ -84,12 +84,8 @@ def test_slices_go_to_the_channels_that_make_the_most_noise():
     """They have large values, or the largest weight of a row, which decides how finely the whole row is rounded."""
     weights = torch.full((6, 4, 3, 3), 0.1)
     weights[:, 3] = 0
-    assert gptq.slices_per_channel(torch.tensor([4.0, 1.0, 1.0, 8.0]), weights, torch.ones(6), 3).tolist() == [
-        4,
-        1,
-        1,
-        1,
-    ]
+    tops = torch.tensor([4.0, 1.0, 1.0, 8.0])
+    assert gptq.slices_per_channel(tops, weights, torch.ones(6), 3).tolist() == [4, 1, 1, 1]
     weights[0, 1] = 1.0  # one of six rows, and the only one that counts
     gain = torch.tensor([1.0, 0, 0, 0, 0, 0])
     assert gptq.slices_per_channel(torch.ones(4), weights, gain, 6).tolist() == [1, 7, 1, 1]

@@ -35,6 +35,8 @@ class Motion:
     """(h, w): which vectors can be believed; None if all can."""
     moved_objects: Mask | None = None
     """(h, w): where an object has moved that the vectors do not follow. Such pixels are not ``known``."""
+    borders: Mask | None = None
+    """(h, w): within one pixel of a border of two surfaces, by the vectors; None if these are."""
     tolerance: float = ROUND_TRIP
     """How far the way back may miss the pixel, in HRLS pixels."""
 
@@ -96,11 +98,13 @@ class ShotMotion:
         """Return a motion as it waits for the frames that need it."""
         if objects is not None:
             known = known & ~objects
+        tolerance = ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP
         return Motion(
             kept(vectors) if vectors.any() else None,
             None if known.all() else kept(known),
             kept(objects) if objects is not None and objects.any() else None,
-            ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP,
+            kept(near_borders(vectors, tolerance)) if vectors.any() else None,
+            tolerance,
         )
 
 

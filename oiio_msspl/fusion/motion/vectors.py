@@ -159,13 +159,21 @@ def near_borders(vectors: Array, tolerance: float) -> Mask:
 
     ``vectors``: (h, w, 2), in pixels. NaN counts as another surface.
     """
-    motion = as_complex(vectors)
-    borders = np.zeros(motion.shape, bool)
-    for turned, pixels in ((motion, borders), (motion.T, borders.T)):
-        differs = ~(np.abs(np.diff(turned, axis=0)) < tolerance)
-        pixels[1:] |= differs
-        pixels[:-1] |= differs
-    return grown(borders)
+    result = np.empty(vectors.shape[:2], np.bool_)
+
+    def work(rows: slice) -> None:
+        top, bottom = max(rows.start - 2, 0), min(rows.stop + 2, len(result))
+        motion = as_complex(vectors[top:bottom])
+        borders = np.zeros(motion.shape, np.bool_)
+        for turned, pixels in ((motion, borders), (motion.T, borders.T)):
+            change = turned[1:] - turned[:-1]
+            differs = ~(np.square(change.real) + np.square(change.imag) < tolerance**2)
+            pixels[1:] |= differs
+            pixels[:-1] |= differs
+        result[rows] = grown(borders)[rows.start - top : rows.stop - top]
+
+    for_row_blocks(work, len(result), vectors[:1].size)
+    return result
 
 
 def as_complex(vectors: Array) -> NDArray[np.complex64]:

@@ -13,7 +13,6 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.shot import Motion
-from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.fusion.neighbours.bands import from_grid, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
 from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
@@ -59,7 +58,7 @@ class ResultBand:
         if path.hops == 1:
             self._borders = _borders(hop.there, self._window, area)
             if path.moved_objects is not None:
-                self._borders |= grown(path.moved_objects, 2)
+                self._borders = self._borders | grown(path.moved_objects, 2)
         warped = _warp(hop.frame, path)
         picture = to_grid(alignment, np.where(path.valid[..., None], warped[RGB], self._own[RGB]), area)
         weight = from_grid(alignment, judge(picture), area) * path.valid
@@ -67,7 +66,7 @@ class ResultBand:
             weight *= self._light.moved_weight
         if self._company is not None:
             weight *= self._company
-        mixed = self._borders | _borders_at(hop, path)
+        mixed = self._borders | _borders_at(hop, path, area)
         here, there = (luminance(images[RGB][mixed]) for images in (self._own, warped))
         weight[mixed] *= likeness(here, there, self._light.darkest, DIFFERENT_MIX)
         # A neighbour may have no alpha.
@@ -84,21 +83,18 @@ def _company(frames: Array) -> Array:
     return np.clip((frames - 1) / np.float32(COMPANY - 1), 0, 1)
 
 
-def _borders_at(hop: Hop[FusedFrame], path: Path) -> Mask:
-    """Find the pixels (h, w) that lead to pixels of a neighbour that may show two surfaces."""
-    window = hop.frame.alignment.hr_data_window
-    place = path.place_in(window)
-    borders = _borders(hop.back, window, place)
-    if path.nearest is None:
-        return borders
-    return borders.reshape(-1).take(path.nearest - (place.y0 - window.y0) * window.width, mode="clip")
+def _borders_at(hop: Hop[FusedFrame], path: Path, area: Window) -> Mask:
+    """Find the pixels (h, w) of an area that lead to pixels of a neighbour that may show two surfaces."""
+    if path.nearest is None or hop.back.borders is None:
+        return _borders(hop.back, hop.frame.alignment.hr_data_window, area)
+    return hop.back.borders.reshape(-1).take(path.nearest, mode="clip")
 
 
 def _borders(motion: Motion, window: Window, area: Window) -> Mask:
     """Return the borders of surfaces (h, w) in an area of a frame."""
-    if motion.vectors is None:
+    if motion.borders is None:
         return np.zeros((area.height, area.width), np.bool_)
-    return near_borders(motion.vectors[area.slices(window)], motion.tolerance)
+    return motion.borders[area.slices(window)]
 
 
 def _warp(frame: FusedFrame, path: Path) -> Images:

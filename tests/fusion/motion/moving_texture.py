@@ -3,7 +3,8 @@
 
 import numpy as np
 
-from oiio_msspl.fusion.motion.shot import Motion
+from oiio_msspl.fusion.motion.shot import ROUND_TRIP, Motion
+from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.fusion.neighbours.path import Hop
 
 HEIGHT, WIDTH, SCALE = 96, 128, 4
@@ -23,7 +24,8 @@ def rms(image, truth, part=slice(None)):
 
 def hop(frame, vectors=None, back=None, known=None, **more):
     """A hop to a frame along vectors, and the way back."""
-    return Hop(frame, Motion(vectors, known, **more), Motion(back, **more))
+    borders, borders_back = (None if ways is None else near_borders(ways, ROUND_TRIP) for ways in (vectors, back))
+    return Hop(frame, Motion(vectors, known, borders=borders, **more), Motion(back, borders=borders_back, **more))
 
 
 def still(frame):

@@ -42,6 +42,9 @@ class FusedFrame(FusedPixels):
     """(h, w): luminance of the HRLS, averaged over the LRHS's pixels."""
     frames: Array | None = None
     """(height, width, 1): number of frames that were averaged; None without neighbours."""
+    coarse: Array | None = None
+    """(h, w, 3): colours of large cells, as :class:`oiio_msspl.fusion.neighbours.trust.Light` judges the frame; None
+    until they are needed."""
     negative: dict[str, int] = field(default_factory=dict)
     """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[Finding] = field(default_factory=list)

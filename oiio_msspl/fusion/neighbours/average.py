@@ -81,7 +81,7 @@ def average_renders(
         return RenderBand(pair, light, low, high, core, area)
 
     weight = _weight(sum(image.shape[-1] for image in high.values()))
-    frames = _average(light, before, after, band, lambda neighbour: neighbour.colours, weight)
+    frames = _average(light, before, after, band, RenderPair.cells, weight)
     hr = _replaced(pair.hr, high, window)
     return hr if pair.is_one_render else _replaced(pair.lr, low, alignment.lr_data_window), hr, frames
 
@@ -106,11 +106,18 @@ def average_results(
     def band(core: Window, area: Window) -> ResultBand:
         return ResultBand(frame, light, images, core, area)
 
-    frames = _average(light, before, after, band, lambda neighbour: [_picture(neighbour)])
+    frames = _average(light, before, after, band, _cells)
     if frame.frames is not None:
         # Averages of averages. If all weights are equal, this is the exact number within 7 percent.
         frames = np.sqrt(np.square(frames) + np.square(frame.frames) - 1)
     return replace(frame, rgb=images[RGB], alpha=images.get("alpha"), frames=frames)
+
+
+def _cells(frame: FusedFrame, light: Light) -> list[Array]:
+    """Return the colours of a fused frame, averaged to the cells of a light. They are kept for its other neighbours."""
+    if frame.coarse is None:
+        frame.coarse = light.cells(_picture(frame))
+    return [frame.coarse]
 
 
 def _picture(frame: FusedFrame) -> Array:
@@ -124,14 +131,14 @@ def _average(
     before: Sequence[Hop[F]],
     after: Sequence[Hop[F]],
     band_of: Callable[[Window, Window], Band[F]],
-    colours_of: Callable[[F], Sequence[Array]],
+    cells_of: Callable[[F, Light], Sequence[Array]],
     weight: float = 1.0,
 ) -> Array:
     """Average a frame with its neighbours, band by band, and return the number of frames (h, w, 1)."""
     window = light.alignment.hr_data_window
     frames: Array = blank((window.height, window.width, 1))
     coarse_light = light.coarser() if light.cell < COARSE // 2 else light
-    sides = two_at_a_time(lambda hops: (hops, _coarse_trust(coarse_light, hops, colours_of)), (before, after))
+    sides = two_at_a_time(lambda hops: (hops, _coarse_trust(coarse_light, hops, cells_of)), (before, after))
 
     def work(core: Window, area: Window) -> None:
         band = band_of(core, area)
@@ -147,7 +154,7 @@ def _average(
     return frames
 
 
-def _coarse_trust(light: Light, hops: Sequence[Hop[F]], colours_of: Callable[[F], Sequence[Array]]) -> list[Array]:
+def _coarse_trust(light: Light, hops: Sequence[Hop[F]], cells_of: Callable[[F, Light], Sequence[Array]]) -> list[Array]:
     """Return how much each neighbour on one side counts by the light of large areas, see :meth:`Light.coarse_trust`."""
     alignment, cell = light.alignment, np.float32(light.cell)
     grid, window = alignment.grid, alignment.hr_data_window
@@ -161,7 +168,7 @@ def _coarse_trust(light: Light, hops: Sequence[Hop[F]], colours_of: Callable[[F]
         moved_y = (to_y - from_y + np.float32((grid.y0 - other.y0) * alignment.scale)) / cell
         y, x = np.mgrid[: light.shape[0], : light.shape[1]].astype(np.float32)
         x, y = x + _of_shape(moved_x, light.shape), y + _of_shape(moved_y, light.shape)
-        colours = [sample_linear(light.cells(image), x, y) for image in colours_of(hop.frame)]
+        colours = [sample_linear(image, x, y) for image in cells_of(hop.frame, light)]
         result.append(light.coarse_trust(colours, _of_shape(path.valid, light.shape)))
     return result
 

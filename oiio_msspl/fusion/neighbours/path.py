@@ -73,7 +73,8 @@ class Path:
             # False for NaN, too. Pixels that leave the window stay where they are.
             good &= (x > window.x0 - 0.5) & (x < window.x1 - 0.5) & (y > window.y0 - 0.5) & (y < window.y1 - 0.5)
             if vector is not None and not good.all():
-                x[~good], y[~good] = from_x[~good], from_y[~good]
+                for position, start_position in ((x, from_x), (y, from_y)):
+                    np.copyto(position, start_position, where=~good)
             if places is not None:
                 end = nearest_indices(x - window.x0, y - window.y0, (window.height, window.width))
                 places[0][rows], places[1][rows], places[2][rows] = x, y, end

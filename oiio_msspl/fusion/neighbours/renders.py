@@ -14,7 +14,7 @@ average of fused frames no longer has.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -66,6 +66,7 @@ class RenderPair:
 
     lr: ReadableRender
     hr: ReadableRender
+    _cells: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def is_one_render(self) -> bool:
@@ -94,6 +95,12 @@ class RenderPair:
             return self.halves(high)
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
         return _bounded(lrhs), high
+
+    def cells(self, light: Light) -> list[Array]:
+        """Return both :attr:`colours`, averaged to the cells of a light. They are kept for its other neighbours."""
+        if not self._cells:
+            self._cells.extend(light.cells(image) for image in self.colours)
+        return self._cells
 
     def halves(self, colours: Array) -> tuple[Array, Array]:
         """Return two pictures of the colours (h, w, 3) of one render whose noise is independent."""

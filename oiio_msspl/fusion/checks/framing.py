@@ -70,12 +70,15 @@ def find_framing(low: Array, high: Array) -> Framing:
     smooth_low, smooth_high = blurred(low, 2), blurred(high, 2)
     fits = [_fit(smooth_low, smooth_high, start) for start in _starts(smooth_low, smooth_high, before)]
     fit = max(fits, key=lambda fit: fit.explained)
+    certain = np.abs(fit.estimate) > CERTAIN * fit.error
+    if not certain.any():
+        return Framing(judged=fits_at_all(before))
     after = fine_fits(_move(low, fit.estimate / (1, 1, max(low.shape) / 2)), high)
     explains = fit.explained >= min(MIN_EXPLAINED, MIN_EXPLAINED_PIXELS / low.size)
     obvious = fit.explained >= OBVIOUS and fits_at_all(after)
     if not obvious and not fits_better(before, after, certain=not explains):
         return Framing(judged=fits_at_all(before))
-    x, y, at_edge = np.where(np.abs(fit.estimate) > CERTAIN * fit.error, fit.estimate, 0)
+    x, y, at_edge = np.where(certain, fit.estimate, 0)
     return Framing(float(x), float(y), float(at_edge / (max(low.shape) / 2)), float(at_edge), judged=True)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.image.arrays import Array, quantile
-from oiio_msspl.image.filters import blurred, box_downsample
+from oiio_msspl.image.filters import blurred, box_downsample, means_around
 
 #: Side of the blocks, in LRHS pixels, whose brightness is compared; and the fewest blocks.
 BLOCK, FEWEST_BLOCKS = 4, 32
@@ -62,8 +62,10 @@ def _halves(values: Array) -> tuple[Array, Array]:
 
 
 def _correlation(a: Array, b: Array) -> float:
-    first, second = (values.astype(np.float64).ravel() for values in (a - a.mean(), b - b.mean()))
-    return float(first @ second / max(np.sqrt((first @ first) * (second @ second)), 1e-30))
+    first, second = (values.astype(np.float64) for values in (a - a.mean(), b - b.mean()))
+    # Sums, because the threads of a long dot product keep a core busy for 0.2 s after it.
+    squares = np.sum(np.square(first)) * np.sum(np.square(second))
+    return float(np.sum(first * second) / max(np.sqrt(squares), 1e-30))
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def fits_better(before: list[Fit], after: list[Fit], *, certain: bool) -> bool:
 def fine_structure(values: Array) -> Array:
     """Return differences (h, w) to the neighbourhood, in units of its RMS, so that no bright corner dominates."""
     fine = values - blurred(values, 4)
-    power = blurred(np.square(fine), 12)
+    (power,) = means_around(np.square(fine), [4])
     return fine / np.sqrt(power + np.float32(1e-3 * float(np.mean(np.square(fine))) + 1e-20))
 
 

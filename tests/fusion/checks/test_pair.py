@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Right pairs fit, wrong ones are noticed: on pictures of rectangles with albedo, normals, light and noise of 4 spp."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -394,7 +396,7 @@ def test_noise_in_a_small_picture_is_no_shift(seed):
     clean = 1 + 0.6 * waves + 0.5 * (x > 70)
     noise = rng.choice([0.05, 0.1, 0.2, 0.4], 2)
     low, high = ((clean * rng.gamma(1 / s**2, s**2, clean.shape)).astype(np.float32) for s in noise)
-    assert find_framing(low, high) == Framing()
+    assert replace(find_framing(low, high), judged=False) == Framing()
 
 
 def test_one_object_suffices_to_notice_a_shift():

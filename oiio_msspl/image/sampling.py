@@ -22,12 +22,18 @@ MOST_CHOSEN = 0.8
 def nearest_indices(x: Array, y: Array, size: tuple[int, int]) -> NDArray[np.intp]:
     """Return the flat indices of the pixels nearest to positions in an image of ``size`` (height, width)."""
     height, width = size
+    indices = _nearest(y, height) * np.intp(width)
+    indices += _nearest(x, width)
+    return indices
+
+
+def _nearest(positions: Array, side: int) -> NDArray[np.int32]:
+    """Return the rows or columns nearest to positions along a side."""
     # `rint` rounds halves to even numbers, which would give two neighbours that move alike the same pixel.
-    column, row = (np.floor(positions + HALF) for positions in (x, y))
-    # Converting floats to 32 bits is four times as fast as to 64 bits.
-    column = np.clip(column, 0, width - 1).astype(np.int32)
-    row = np.clip(row, 0, height - 1).astype(np.int32)
-    return row * np.intp(width) + column
+    nearest = positions + HALF
+    np.floor(nearest, out=nearest)
+    np.clip(nearest, 0, side - 1, out=nearest)
+    return nearest.astype(np.int32)  # four times as fast as to 64 bits
 
 
 def sample_cubic(

@@ -162,7 +162,7 @@ def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mas
         around = slice(max(first - REACH, 0), min(last + REACH, height))
         other = np.zeros((around.stop - around.start, width), np.bool_)
         for name, image in here.items():
-            one, two = (_finite(planes_of(x[around])) for x in (image, there[name]))
+            one, two = (_finite(np.moveaxis(x[around], -1, 0)) for x in (image, there[name]))
             differs = _differing(one, two, turn if name == NORMAL else DIFFERENCE, compared[around])
             if differs.any():
                 other |= sum_3x3(differs.astype(np.float32)) >= PIXELS

@@ -6,5 +6,5 @@ A command parses, calls one library function, and prints.
 
 import os
 
-# NumPy's linear algebra keeps a core busy for 0.2 s after each use of its threads. Nothing here is large enough to gain.
+# The threads of NumPy's linear algebra keep a core busy for 0.2 s after each use. Nothing here is large enough to gain.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -32,6 +32,9 @@ LITTLE_WITH_CLEAN_AOVS = 0.12
 #: The limit for pairs of two sizes, by scale. Their difference is free of texture. The larger the pixels of the LRHS,
 #: the more detail the models for more noise lose, so the limit grows.
 LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
+#: The limit for pairs of two sizes and a model that denoises albedo and normal before, at every scale. It is one of the
+#: mean of both renders: if the LRHS has four times the samples, the HRLS may have some 4 spp.
+LITTLE_OF_MEAN = 0.075
 #: The limit for noise that a filter has spread is this number times the scale. It grows for the same reason.
 LITTLE_SPREAD = 0.009
 #: Blocks of an AOV show edges or texture from this variance on. There, neighbouring pixels of clean AOVs correlate by
@@ -51,14 +54,16 @@ def has_little_noise(
     Args:
         lr, hr, alignment: of the pair.
         spread: a filter has spread the noise over neighbouring pixels.
-        denoises_aovs: the model for little noise denoises albedo and normal before.
+        denoises_aovs: the model for little noise denoises albedo and normal before. Then it gains in more noise of the
+            HRLS, too, if the LRHS has much less.
     """
     scale = alignment.scale
     if spread or scale == ONE_SIZE:
         of_one_size = LITTLE_WITH_CLEAN_AOVS if denoises_aovs else LITTLE
         limit, found = (LITTLE_SPREAD * scale if spread else of_one_size), _noise_in_blocks(lr, hr, alignment)
     else:
-        limit, found = LITTLE_OF_PAIR[scale], _noise_by_difference(lr, hr, alignment)
+        limit = LITTLE_OF_MEAN if denoises_aovs else LITTLE_OF_PAIR[scale]
+        found = _noise_by_difference(lr, hr, alignment, of_mean=denoises_aovs)
     return len(found) > 0 and bool(np.quantile(found, SMOOTH) < limit)
 
 
@@ -76,16 +81,20 @@ def _noise_in_blocks(lr: ReadableRender, hr: ReadableRender, alignment: Alignmen
     return np.concatenate(deviations)
 
 
-def _noise_by_difference(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> NDArray[np.float64]:
+def _noise_by_difference(
+    lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, of_mean: bool
+) -> NDArray[np.float64]:
     """Return the deviation (n) of an HRLS pixel's noise in blocks, by the difference of both renders.
 
-    For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel.
+    For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. If ``of_mean``, an LRHS with less
+    noise than the HRLS makes it smaller: 2 (1 - share) is the variance of the mean of both, relative to equal shares.
     """
     lows, highs = [], []
     for low, high, exposure in samples_of(lr, hr, alignment):
         lows.append(encode_radiance(low, exposure))
         highs.append(encode_radiance(box_downsample(high, alignment.scale), exposure))
-    gain = alignment.scale * np.sqrt(lrhs_share(np.stack(lows), np.stack(highs)))
+    share = lrhs_share(np.stack(lows), np.stack(highs))
+    gain = alignment.scale * np.sqrt(share * (min(1.0, 2 * (1 - share)) if of_mean else 1.0))
     # All colours count alike: blue noise is hardly seen in luminance.
     squares = [np.square(low - high, dtype=np.float64).mean(axis=-1) for low, high in zip(lows, highs, strict=True)]
     deviations = gain * np.sqrt(np.concatenate([blocks_of(plane) for plane in squares]).mean(axis=1))

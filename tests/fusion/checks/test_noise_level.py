@@ -59,6 +59,17 @@ def test_a_model_that_denoises_albedo_and_normal_before_is_taken_in_more_noise(l
         assert family_for_noise(family, hr, hr, align(hr, hr))[0] == family + "-clean" * clean
 
 
+@pytest.mark.parametrize(("of_lr", "best"), [(0.25, False), (0.03, True)])
+def test_a_clean_lrhs_makes_up_for_a_noisy_hrls(of_lr, best):
+    """For a model that denoises albedo and normal before. The other one would leave their noise."""
+    hr = render_of(checks(64), 0.5)
+    noise = np.random.default_rng(3).normal(1, of_lr, (SIZE // 2, SIZE // 2, 1))
+    light = box_downsample(checks(64), 2) * noise
+    lr = Render.from_arrays(rgb=light.astype(np.float32))
+    for family, clean in (("joint-large", best), ("joint", False)):
+        assert family_for_noise(family, lr, hr, align(lr, hr))[0] == family + "-clean" * clean
+
+
 @pytest.mark.parametrize("scale", [2, 4])
 @pytest.mark.parametrize(("noise", "little"), [(0.03, True), (0.3, False)])
 def test_fine_texture_of_a_pair_is_no_noise(scale, noise, little):

@@ -156,7 +156,7 @@ def family_for_noise(
     It is a key of ``NOISE``; "" for noise that needs no counterpart, and None without noise. Noise that the pixel
     filter has spread needs weights of its own. Where there is little noise, a denoiser of the HRLS at full size is more
     accurate, which the LRHS only corrects; it predicts no ``error``. If noise is not spread, it needs a clean albedo
-    and normal, except that of ``best``, which denoises them before.
+    and normal, except that of ``best`` for renders of one size, which denoises them before.
     """
     spread, scale = is_noise_spread(lr, hr, alignment), alignment.scale
     kind = SPREAD if spread else ""
@@ -164,7 +164,7 @@ def family_for_noise(
     denoises_aovs = family == QUALITIES["best"]
     if clean and has_little_noise(lr, hr, alignment, spread=bool(spread), denoises_aovs=denoises_aovs):
         least = CLEAN_AOVS if scale == ONE_SIZE else CLEAN_AOVS_OF_PAIR
-        if spread or denoises_aovs or has_clean_aovs(hr, alignment, least):
+        if spread or (denoises_aovs and scale == ONE_SIZE) or has_clean_aovs(hr, alignment, least):
             return clean, kind + CLEAN
     return family + kind, None if spread is None else kind
 

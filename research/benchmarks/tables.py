@@ -22,7 +22,7 @@ from typing import Any
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import ONE_SIZE, SPREAD
 from research.benchmarks import detail, passes, results, runtime
-from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label
+from research.benchmarks.layout import Column, Line, Table, Wanted, clean
 from research.benchmarks.one_size import SEEDS
 from research.benchmarks.results import MEAN, Row
 from research.benchmarks.runtime import SAME_WORK
@@ -180,22 +180,6 @@ FILTERS = Table(
     ("PSNR at 2 spp",),
     ("method",),
     [Column(name, "psnr", {"spp": 2, "filter": name}) for name in KINDS],
-)
-
-TIME = Table(
-    ("time_frame",),
-    ("method", "machine"),
-    ("seconds for 1024 x 1024 in memory, 2 cores",),
-    [Line([label(method)], {"method": method}) for method in (FAST, BALANCED, BEST, "paper-x2")]
-    + [Line([method], {"method": method}) for method in (runtime.OIDN_FAST, runtime.OIDN, runtime.OIDN_PREFILTERED)],
-    [
-        column
-        for name, ending in MACHINES.items()
-        for column in (
-            Column(name, "seconds", _on(ending)),
-            Column("of OIDN's", "seconds", _on(ending), "ratio", against={"method": runtime.OIDN}),
-        )
-    ],
 )
 
 GPU_TIMES = Table(
@@ -415,15 +399,13 @@ TABLES: dict[Path, dict[str, Block]] = {
         "detail": DETAIL,
         "sample_counts": SAMPLE_COUNTS,
         "spread_noise": SPREAD_NOISE,
-        "filters": FILTERS,
-        "time": TIME,
         "shots": SHOTS,
         "passes_summary": PASSES_SUMMARY,
         "stability": STABILITY,
         "pair_checks": PAIR_CHECKS,
-        "confidence": CONFIDENCE,
-        "paper": findings,
     },
+    ROOT / "docs/design/model.md": {"confidence": CONFIDENCE, "filters": FILTERS},
+    ROOT / "docs/design/training.md": {"paper": findings},
     ROOT / "docs/guide/gpu.md": {"gpu_times": GPU_TIMES},
     ROOT / "docs/design/temporal.md": {"temporal_time": TIME_OF_SHOTS},
 }

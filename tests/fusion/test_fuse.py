@@ -237,7 +237,7 @@ def test_a_firefly_of_any_size_stays_where_it_is(session, scale, value):
     fused = fuse(low, high, session).rgb
     assert np.isfinite(fused).all()
     far = slice(8 * scale, None)
-    np.testing.assert_allclose(fused[far, far], expected[far, far], rtol=0.05)
+    np.testing.assert_allclose(fused[far, far], expected[far, far], rtol=0.05, atol=5e-4)
 
 
 def test_a_pixel_that_the_lrhs_rules_out_is_dimmed_before_it_is_fused(session, scale):
@@ -669,7 +669,7 @@ def test_a_firefly_of_the_lrhs_is_dimmed_to_what_the_hrls_allows(session, scale)
     low.layers["rgb"][3, 3] = 64 * brightest
     expected = fuse(low, high, session).rgb
     low.layers["rgb"][3, 3] = 1e6
-    np.testing.assert_allclose(fuse(low, high, session).rgb, expected, rtol=0.05)
+    np.testing.assert_allclose(fuse(low, high, session).rgb, expected, rtol=0.05, atol=5e-4)
 
 
 def test_another_frames_albedo_is_noticed(session, scale):

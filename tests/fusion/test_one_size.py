@@ -69,6 +69,16 @@ def test_a_bright_highlight_with_noise_is_denoised():
     assert fuse(render, render, session).rgb[inner].std() < 0.4 * images["rgb"][inner].std()
 
 
+@pytest.mark.parametrize("colour", [(0, 10, 0), (0, 60, 0), (30, 0, 0), (0, 8, 8)])
+def test_pure_light_with_noise_keeps_its_brightness_and_its_colour(colour):
+    session = load_model(1, "fast", threads=1)
+    images = layers()
+    images["rgb"][30:80, 50:110] = noisy(np.full((50, 60, 3), colour, np.float32), 4, 1)
+    render = Render.from_arrays("hr", **images)
+    light = fuse(render, render, session).rgb[40:70, 60:100].mean(axis=(0, 1))
+    np.testing.assert_allclose(light, colour, rtol=0.1, atol=0.005 * max(colour))
+
+
 def test_the_share_of_two_renders_is_found_or_given():
     """A render with 64 times the samples of the other one decides the result."""
     session = load_model(1, "fast", threads=1)

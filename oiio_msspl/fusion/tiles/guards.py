@@ -16,8 +16,8 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TileFeatures
-from oiio_msspl.image.arrays import Array, Mask, planes_of
-from oiio_msspl.image.filters import all_within, box_downsample, grown, max_3x3, neighbours
+from oiio_msspl.image.arrays import FLOAT_MAX, Array, Mask, planes_of
+from oiio_msspl.image.filters import all_within, box_downsample, grown, max_3x3, means_around, neighbours
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
@@ -35,6 +35,9 @@ LIGHT = 4096.0
 #: Exposed radiance above which a light without noise keeps the pixels of the only render. It has no noise if all of
 #: 3 x 3 pixels differ from the one in the middle by this share of it at most.
 STEADY_LIGHT, STEADY = 4.0, 0.02
+#: Share of the brightest channel, where it exceeds an exposed radiance, that the other channels have at least for the
+#: network. Reach of the means that tell how pure the colour is.
+LEAST_CHANNEL, BRIGHT, PURE_REACH = np.float32(0.01), 0.5, 3
 #: A surface becomes black if this many LRHS pixels around are black. Networks look as far.
 FAR = 15
 #: A surface becomes black in a pass if this many HRLS pixels around are black. Black passes are common, and a network
@@ -55,6 +58,47 @@ def dim_fireflies(tile: TileFeatures) -> tuple[Array, dict[str, Array]]:
     hrls_limit = _brightness_limit(lrhs_rgb, tile)
     dimmed = {name: _limit(hrls[name], hrls_limit, tile.scale) for name in RADIANCE_FEATURES if name in hrls}
     return np.minimum(lrhs_rgb, lrhs_limit), hrls | dimmed
+
+
+def without_pure_colours(rgb: Array, exposure: float) -> Array:
+    """Return a colour (h, w, 3) in which no bright pixel lacks a channel; itself if none does.
+
+    Networks make pure colours dark, such as the green of a laser: down to 0.2 of its light.
+    """
+    least = _least_channel(rgb, exposure)
+    return np.maximum(rgb, least) if (rgb < least).any() else rgb
+
+
+def pure_again(fused: Array, rgb: Array, mixed: Array, exposure: float) -> Array:
+    """Return a fused picture (h, w, 3) without the light that :func:`without_pure_colours` has added.
+
+    Args:
+        fused: what the network made of ``mixed``.
+        rgb, mixed: the HRLS, and its colour in which no bright pixel lacks a channel.
+        exposure: of the frame.
+    """
+    if mixed is rgb:
+        return fused
+    fused, least = fused.copy(), _least_channel(fused, exposure)[..., 0]
+    for plane, pure, changed in zip(*(np.moveaxis(image, -1, 0) for image in (fused, rgb, mixed)), strict=True):
+        differs = changed > pure
+        if not differs.any():
+            continue
+        places = (np.flatnonzero(differs.any(axis=axis)) for axis in (1, 0))
+        box = tuple(slice(max(used[0] - PURE_REACH, 0), used[-1] + PURE_REACH + 1) for used in places)
+        differs, pure, changed = differs[box], pure[box], changed[box]
+        added = np.divide(changed - pure, changed, out=np.zeros(pure.shape, np.float32), where=differs)
+        share, area = (means_around(image, [PURE_REACH])[0] for image in (added, differs.astype(np.float32)))
+        share = np.divide(share, area, out=np.zeros_like(share), where=area > 0)
+        # Networks change the small channel, and the pixels beside pure light have more of it.
+        plane[box] *= 1 - share * np.clip(4 - plane[box] / np.maximum(least[box], np.float32(1e-30)), 0, 1)
+    return fused
+
+
+def _least_channel(rgb: Array, exposure: float) -> Array:
+    """Return what each channel of a pixel has at least for the network, (h, w, 1)."""
+    brightest = reduce(np.maximum, (rgb[..., channel : channel + 1] for channel in range(3)))
+    return LEAST_CHANNEL * np.maximum(brightest - np.float32(min(BRIGHT / exposure, FLOAT_MAX)), 0)
 
 
 def _limit(hrls: Array, limit: Array, scale: int) -> Array:
@@ -119,8 +163,8 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
 def steady_lights(rgb: Array, exposure: float) -> Array | None:
     """Return the colour of bright areas of a render (h, w, 3) that have no noise, such as lamps and windows.
 
-    Networks in 8 bits have no codes for very bright or saturated light, and it loses most of its energy. Two renders
-    tell what is missing, one render does not. Without noise, there is nothing to remove.
+    Networks in 8 bits have no codes for very bright light, and it loses most of its energy. Two renders tell what is
+    missing, one render does not. Without noise, there is nothing to remove.
 
     Returns:
         (h, w, 3), scene linear; 0 elsewhere. None if there is no such area.

@@ -15,7 +15,15 @@ from oiio_msspl.aovs.features import ALBEDO, RGB
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import TileFeatures, in_hrls_pixels
-from oiio_msspl.fusion.tiles.guards import LAYER_REACH, SMEAR, black_in_both, check_finite, repeated
+from oiio_msspl.fusion.tiles.guards import (
+    LAYER_REACH,
+    SMEAR,
+    black_in_both,
+    check_finite,
+    pure_again,
+    repeated,
+    without_pure_colours,
+)
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile, alpha_as_colour
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
@@ -189,8 +197,11 @@ def _run_network(tile: PreparedTile, session: Session, exposure: float, shares: 
     if tile.noise_free:
         errors = {"error": np.zeros_like(tile.hrls[RGB][..., :1])} if error else {}
         return {"fused": tile.hrls[RGB], **errors, **{name: tile.features.hrls[name] for name in tile.aovs}}
-    images = session.run(tile.lrhs, tile.hrls, exposure, shares, error=error, aovs=tile.aovs)
+    colours = [without_pure_colours(render[RGB], exposure) for render in (tile.lrhs, tile.hrls)]
+    low, high = (render | {RGB: rgb} for render, rgb in zip((tile.lrhs, tile.hrls), colours, strict=True))
+    images = session.run(low, high, exposure, shares, error=error, aovs=tile.aovs)
     check_finite(session, *images.values())
+    images["fused"] = pure_again(images["fused"], tile.hrls[RGB], colours[1], exposure)
     if ALBEDO in images:
         # The albedo of an emitter may be its light. The network only knows albedos up to 1.
         albedo = tile.features.hrls[ALBEDO]

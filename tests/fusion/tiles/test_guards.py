@@ -16,6 +16,8 @@ from oiio_msspl.fusion.tiles.guards import (
     bright_lights,
     dim_fireflies,
     is_noise_free,
+    pure_again,
+    without_pure_colours,
 )
 
 
@@ -176,3 +178,20 @@ def test_the_pixels_around_a_surface_are_not_empty_where_light_is_near():
     empty = EmptyRegions(low).mask(tile(low, {RGB: high, "alpha": alpha}), (slice(0, 16), slice(0, 16)))[..., 0]
     near = np.s_[16 - SMEAR : 17 + SMEAR]
     assert not empty[near, near].any() and empty[17 + SMEAR :].all()
+
+
+def test_only_bright_pixels_that_lack_a_channel_get_one():
+    usual = np.random.default_rng(0).uniform(0.05, 3, (8, 8, 3)).astype(np.float32)
+    assert without_pure_colours(usual, 1.0) is usual
+    dark = np.zeros((8, 8, 3), np.float32)
+    dark[..., 1] = 0.5
+    assert without_pure_colours(dark, 1.0) is dark
+    np.testing.assert_allclose(without_pure_colours(3 * dark, 1.0), np.float32([0.01, 1.5, 0.01]) + 0 * dark)
+
+
+@pytest.mark.parametrize("red", [0.0, 0.04])
+def test_a_pure_colour_comes_back_and_the_pixels_beside_it_stay(red):
+    rgb = np.full((24, 24, 3), 0.2, np.float32)
+    rgb[:, :12] = red, 10, 0
+    mixed = without_pure_colours(rgb, 1.0)
+    np.testing.assert_allclose(pure_again(mixed, rgb, mixed, 1.0), rgb, atol=1e-6)

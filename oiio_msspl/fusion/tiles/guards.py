@@ -35,9 +35,10 @@ LIGHT = 4096.0
 #: Exposed radiance above which a light without noise keeps the pixels of the only render. It has no noise if all of
 #: 3 x 3 pixels differ from the one in the middle by this share of it at most.
 STEADY_LIGHT, STEADY = 4.0, 0.02
-#: Share of the brightest channel, where it exceeds an exposed radiance, that the other channels have at least for the
-#: network. Reach of the means that tell how pure the colour is.
-LEAST_CHANNEL, BRIGHT, PURE_REACH = np.float32(0.01), 0.5, 3
+#: Each channel has at least a share of the brightest one for the network: none up to the first exposed radiance, and
+#: from the second one on half of ``LEAST_CHANNEL`` and more. Reach of the means that tell how much of a channel was
+#: added, and the share from which on it may be all of it.
+LEAST_CHANNEL, BRIGHT, DAZZLING, PURE_REACH, PURE = np.float32(0.1), 0.5, 9.0, 3, 0.94
 #: A surface becomes black if this many LRHS pixels around are black. Networks look as far.
 FAR = 15
 #: A surface becomes black in a pass if this many HRLS pixels around are black. Black passes are common, and a network
@@ -63,7 +64,7 @@ def dim_fireflies(tile: TileFeatures) -> tuple[Array, dict[str, Array]]:
 def without_pure_colours(rgb: Array, exposure: float) -> Array:
     """Return a colour (h, w, 3) in which no bright pixel lacks a channel; itself if none does.
 
-    Networks make pure colours dark, such as the green of a laser: down to 0.2 of its light.
+    Networks make pure colours dark, such as the green of a laser: they keep as little as a fifth of its light.
     """
     least = _least_channel(rgb, exposure)
     return np.maximum(rgb, least) if (rgb < least).any() else rgb
@@ -80,25 +81,28 @@ def pure_again(fused: Array, rgb: Array, mixed: Array, exposure: float) -> Array
     if mixed is rgb:
         return fused
     fused, least = fused.copy(), _least_channel(fused, exposure)[..., 0]
+    bright = _least_channel(rgb, exposure)[..., 0] > 0
     for plane, pure, changed in zip(*(np.moveaxis(image, -1, 0) for image in (fused, rgb, mixed)), strict=True):
         differs = changed > pure
         if not differs.any():
             continue
         places = (np.flatnonzero(differs.any(axis=axis)) for axis in (1, 0))
         box = tuple(slice(max(used[0] - PURE_REACH, 0), used[-1] + PURE_REACH + 1) for used in places)
-        differs, pure, changed = differs[box], pure[box], changed[box]
-        added = np.divide(changed - pure, changed, out=np.zeros(pure.shape, np.float32), where=differs)
-        share, area = (means_around(image, [PURE_REACH])[0] for image in (added, differs.astype(np.float32)))
-        share = np.divide(share, area, out=np.zeros_like(share), where=area > 0)
-        # Networks change the small channel, and the pixels beside pure light have more of it.
-        plane[box] *= 1 - share * np.clip(4 - plane[box] / np.maximum(least[box], np.float32(1e-30)), 0, 1)
+        weight = bright[box] / changed[box].max()  # sums of the largest floats would overflow
+        own, light = (means_around(image[box] * weight, [PURE_REACH])[0] for image in (pure, changed))
+        added = 1 - np.divide(own, light, out=np.ones_like(own), where=light > 0)
+        # Pixels at the edge have light of what is beside them. Networks change the small channel, and mix it there.
+        added = np.maximum(added, np.minimum(2 * added - np.float32(PURE), 1))
+        plane[box] *= 1 - added * np.clip(4 - plane[box] / np.maximum(least[box], np.float32(1e-30)), 0, 1)
     return fused
 
 
 def _least_channel(rgb: Array, exposure: float) -> Array:
     """Return what each channel of a pixel has at least for the network, (h, w, 1)."""
     brightest = reduce(np.maximum, (rgb[..., channel : channel + 1] for channel in range(3)))
-    return LEAST_CHANNEL * np.maximum(brightest - np.float32(min(BRIGHT / exposure, FLOAT_MAX)), 0)
+    dark, light = (np.float32(min(value / exposure, FLOAT_MAX)) for value in (BRIGHT, DAZZLING))
+    above = np.maximum(brightest - dark, 0)
+    return LEAST_CHANNEL * above * (above / (above + light))
 
 
 def _limit(hrls: Array, limit: Array, scale: int) -> Array:

@@ -195,3 +195,12 @@ def test_a_pure_colour_comes_back_and_the_pixels_beside_it_stay(red):
     rgb[:, :12] = red, 10, 0
     mixed = without_pure_colours(rgb, 1.0)
     np.testing.assert_allclose(pure_again(mixed, rgb, mixed, 1.0), rgb, atol=1e-6)
+
+
+def test_rare_light_of_another_colour_stays_in_pure_light():
+    rgb = np.zeros((32, 32, 3), np.float32) + np.float32([0, 10, 0])
+    rgb[::4, ::4, 0] = 8
+    mixed = without_pure_colours(rgb, 1.0)
+    fused = np.broadcast_to(mixed.mean(axis=(0, 1)), mixed.shape)
+    red = pure_again(fused, rgb, mixed, 1.0)[8:-8, 8:-8, 0]
+    np.testing.assert_allclose(red.mean(), 0.5, rtol=0.15)

@@ -10,7 +10,7 @@ from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.model.contract import ONE_SIZE
 
 #: PSNR in dB that one render has over two sizes with the same samples: the least and the most, for 2 to 128 spp.
-ONE_OVER_TWO_SIZES = 0.19, 1.53
+ONE_OVER_TWO_SIZES = 0.18, 1.53
 #: PSNR in dB that three quarters of 8 spp in the HRLS have over half of them.
 THREE_QUARTERS = 0.25
 #: PSNR in dB that neighbouring frames with motion vectors add, at x2.

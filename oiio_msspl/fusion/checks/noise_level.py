@@ -32,8 +32,8 @@ LITTLE_WITH_CLEAN_AOVS = 0.12
 #: The limit for pairs of two sizes, by scale. Their difference is free of texture. The larger the pixels of the LRHS,
 #: the more detail the models for more noise lose, so the limit grows.
 LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
-#: The limit for pairs of two sizes and a model that denoises albedo and normal before, at every scale. It is one of the
-#: mean of both renders: if the LRHS has four times the samples, the HRLS may have some 4 spp.
+#: The limit for pairs of two sizes and a model that denoises albedo and normal before, at every scale. It holds for the
+#: noise of both renders' mean: if the LRHS has 16 times the samples of the HRLS in the same area, 4 spp may be enough.
 LITTLE_OF_MEAN = 0.075
 #: The limit for noise that a filter has spread is this number times the scale. It grows for the same reason.
 LITTLE_SPREAD = 0.009

@@ -35,10 +35,12 @@ LIGHT = 4096.0
 #: Exposed radiance above which a light without noise keeps the pixels of the only render. It has no noise if all of
 #: 3 x 3 pixels differ from the one in the middle by this share of it at most.
 STEADY_LIGHT, STEADY = 4.0, 0.02
-#: Each channel has at least a share of the brightest one for the network: none up to the first exposed radiance, and
-#: from the second one on half of ``LEAST_CHANNEL`` and more. Reach of the means that tell how much of a channel was
-#: added, and the share from which on it may be all of it.
-LEAST_CHANNEL, BRIGHT, DAZZLING, PURE_REACH, PURE = np.float32(0.1), 0.5, 9.0, 3, 0.94
+#: For the network, each channel of a pixel has at least this share of what the brightest channel has above ``BRIGHT``
+#: (exposed radiance). Half of the share holds at ``DAZZLING`` above it, and less of it in darker light.
+LEAST_CHANNEL, BRIGHT, DAZZLING = np.float32(0.1), 0.5, 9.0
+#: How much was added to a channel is the mean of the pixels up to this number of rows and columns away. A channel of
+#: which a larger share than ``PURE`` was added may have no light of its own.
+PURE_REACH, PURE = 3, np.float32(0.94)
 #: A surface becomes black if this many LRHS pixels around are black. Networks look as far.
 FAR = 15
 #: A surface becomes black in a pass if this many HRLS pixels around are black. Black passes are common, and a network
@@ -70,7 +72,7 @@ def without_pure_colours(rgb: Array, exposure: float) -> Array:
     return np.maximum(rgb, least) if (rgb < least).any() else rgb
 
 
-def pure_again(fused: Array, rgb: Array, mixed: Array, exposure: float) -> Array:
+def with_pure_colours(fused: Array, rgb: Array, mixed: Array, exposure: float) -> Array:
     """Return a fused picture (h, w, 3) without the light that :func:`without_pure_colours` has added.
 
     Args:
@@ -92,17 +94,21 @@ def pure_again(fused: Array, rgb: Array, mixed: Array, exposure: float) -> Array
         own, light = (means_around(image[box] * weight, [PURE_REACH])[0] for image in (pure, changed))
         added = 1 - np.divide(own, light, out=np.ones_like(own), where=light > 0)
         # Pixels at the edge have light of what is beside them. Networks change the small channel, and mix it there.
-        added = np.maximum(added, np.minimum(2 * added - np.float32(PURE), 1))
+        added = np.maximum(added, np.minimum(2 * added - PURE, 1))
         plane[box] *= 1 - added * np.clip(4 - plane[box] / np.maximum(least[box], np.float32(1e-30)), 0, 1)
     return fused
 
 
 def _least_channel(rgb: Array, exposure: float) -> Array:
     """Return what each channel of a pixel has at least for the network, (h, w, 1)."""
-    brightest = reduce(np.maximum, (rgb[..., channel : channel + 1] for channel in range(3)))
-    dark, light = (np.float32(min(value / exposure, FLOAT_MAX)) for value in (BRIGHT, DAZZLING))
-    above = np.maximum(brightest - dark, 0)
-    return LEAST_CHANNEL * above * (above / (above + light))
+    bright, dazzling = (np.float32(min(value / exposure, FLOAT_MAX)) for value in (BRIGHT, DAZZLING))
+    above = np.maximum(_brightest(rgb) - bright, 0)
+    return LEAST_CHANNEL * above * (above / (above + dazzling))
+
+
+def _brightest(rgb: Array) -> Array:
+    """Return the brightest channel of each pixel of an image (h, w, 3), (h, w, 1)."""
+    return reduce(np.maximum, (rgb[..., channel : channel + 1] for channel in range(3)))
 
 
 def _limit(hrls: Array, limit: Array, scale: int) -> Array:
@@ -173,7 +179,7 @@ def steady_lights(rgb: Array, exposure: float) -> Array | None:
     Returns:
         (h, w, 3), scene linear; 0 elsewhere. None if there is no such area.
     """
-    brightest = reduce(np.maximum, (rgb[..., channel] for channel in range(3)))
+    brightest = _brightest(rgb)[..., 0]
     least = np.float32(STEADY_LIGHT / exposure)
     rows, columns = np.nonzero(brightest > least)
     if not rows.size:
@@ -263,8 +269,7 @@ class EmptyRegions:
         self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
         self._has_rare_light = np.zeros_like(self._black)
         if of_pass and self._black.any():
-            light = reduce(np.maximum, (lrhs_rgb[..., c : c + 1] for c in range(3)))
-            self._has_rare_light = grown(_rare_light(light, 0, 0) > 0, _SQUARE)
+            self._has_rare_light = grown(_rare_light(_brightest(lrhs_rgb), 0, 0) > 0, _SQUARE)
 
     def mask(self, tile: TileFeatures, window: tuple[slice, slice]) -> Mask | None:
         """Return the empty HRLS pixels of a tile, (s*h, s*w, 1); None if no LRHS pixel is black.

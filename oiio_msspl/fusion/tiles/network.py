@@ -20,8 +20,8 @@ from oiio_msspl.fusion.tiles.guards import (
     SMEAR,
     black_in_both,
     check_finite,
-    pure_again,
     repeated,
+    with_pure_colours,
     without_pure_colours,
 )
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile, alpha_as_colour
@@ -201,7 +201,7 @@ def _run_network(tile: PreparedTile, session: Session, exposure: float, shares: 
     low, high = (render | {RGB: rgb} for render, rgb in zip((tile.lrhs, tile.hrls), colours, strict=True))
     images = session.run(low, high, exposure, shares, error=error, aovs=tile.aovs)
     check_finite(session, *images.values())
-    images["fused"] = pure_again(images["fused"], tile.hrls[RGB], colours[1], exposure)
+    images["fused"] = with_pure_colours(images["fused"], tile.hrls[RGB], colours[1], exposure)
     if ALBEDO in images:
         # The albedo of an emitter may be its light. The network only knows albedos up to 1.
         albedo = tile.features.hrls[ALBEDO]

@@ -16,7 +16,7 @@ from oiio_msspl.fusion.tiles.guards import (
     bright_lights,
     dim_fireflies,
     is_noise_free,
-    pure_again,
+    with_pure_colours,
     without_pure_colours,
 )
 
@@ -194,7 +194,7 @@ def test_a_pure_colour_comes_back_and_the_pixels_beside_it_stay(red):
     rgb = np.full((24, 24, 3), 0.2, np.float32)
     rgb[:, :12] = red, 10, 0
     mixed = without_pure_colours(rgb, 1.0)
-    np.testing.assert_allclose(pure_again(mixed, rgb, mixed, 1.0), rgb, atol=1e-6)
+    np.testing.assert_allclose(with_pure_colours(mixed, rgb, mixed, 1.0), rgb, atol=1e-6)
 
 
 def test_rare_light_of_another_colour_stays_in_pure_light():
@@ -202,5 +202,5 @@ def test_rare_light_of_another_colour_stays_in_pure_light():
     rgb[::4, ::4, 0] = 8
     mixed = without_pure_colours(rgb, 1.0)
     fused = np.broadcast_to(mixed.mean(axis=(0, 1)), mixed.shape)
-    red = pure_again(fused, rgb, mixed, 1.0)[8:-8, 8:-8, 0]
+    red = with_pure_colours(fused, rgb, mixed, 1.0)[8:-8, 8:-8, 0]
     np.testing.assert_allclose(red.mean(), 0.5, rtol=0.15)

@@ -76,7 +76,9 @@ class ShotMotion:
         # If nothing but objects moves, they have moved at the same pixels of both frames.
         same = source.kind == STATIC and not source.fields and first.hr.data_window == second.hr.data_window
         back, back_known = (forth, known) if same else source.read(second, first, -1)
-        zero = any(mask.any() and not way.any() for way, mask in ((forth, known), (back, back_known)))
+        borders = self._borders(forth)
+        back_borders = borders if same else self._borders(back)
+        zero = (borders is None and known.any()) or (back_borders is None and back_known.any())
         if zero and not source.zeros_are_right(first, second):
             return "are 0, though the picture moves"
         if source.misleads(first, second, forth, known):
@@ -85,26 +87,35 @@ class ShotMotion:
         if objects is not None and source.kind == VECTORS:
             # Pixels are followed there and back, so one direction tells both. Where the way back leads elsewhere, the
             # surface is only hidden.
-            objects &= ~grown(near_borders(forth, ROUND_TRIP), BESIDE_BORDERS)
+            if borders is not None:
+                objects &= ~grown(borders, BESIDE_BORDERS)
             hidden = objects & ~_leads_back(objects, forth, back, first.hr.data_window, second.hr.data_window)
-            return self._motion(forth, known & ~hidden, objects & ~hidden), self._motion(back, back_known, None)
-        there = self._motion(forth, known, objects)
+            there = self._motion(forth, known & ~hidden, objects & ~hidden, borders)
+            return there, self._motion(back, back_known, None, back_borders)
+        there = self._motion(forth, known, objects, borders)
         if same:
             return there, there
         objects = source.moved_objects(second, first, back, back_known) if back_known.any() else None
-        return there, self._motion(back, back_known, objects)
+        return there, self._motion(back, back_known, objects, back_borders)
 
-    def _motion(self, vectors: Array, known: Mask, objects: Mask | None) -> Motion:
+    @property
+    def _tolerance(self) -> float:
+        return ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP
+
+    def _borders(self, vectors: Array) -> Mask | None:
+        """Find the borders of surfaces (h, w) by vectors; None if these are 0 everywhere."""
+        return near_borders(vectors, self._tolerance) if vectors.any() else None
+
+    def _motion(self, vectors: Array, known: Mask, objects: Mask | None, borders: Mask | None) -> Motion:
         """Return a motion as it waits for the frames that need it."""
         if objects is not None:
             known = known & ~objects
-        tolerance = ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP
         return Motion(
-            kept(vectors) if vectors.any() else None,
+            None if borders is None else kept(vectors),
             None if known.all() else kept(known),
             kept(objects) if objects is not None and objects.any() else None,
-            kept(near_borders(vectors, tolerance)) if vectors.any() else None,
-            tolerance,
+            None if borders is None else kept(borders),
+            self._tolerance,
         )
 
 

@@ -68,8 +68,8 @@ def other_surfaces(
         last = min(top + rows, height)
         around = slice(max(top - REACH, 0), min(last + REACH, height))
         area = Window(window.x0, window.y0 + around.start, window.x1, window.y0 + around.stop)
-        layers, compared = _at_places(there, names, area, vectors[around], known[around])
-        differs = _differ(here.read(area, names), layers, compared, TURN if turns else DIFFERENCE)
+        layers = {name: planes_of(image) for name, image in here.read(area, names).items()}
+        differs = _differ(layers, there, area, vectors[around], known[around], TURN if turns else DIFFERENCE)
         result[top:last] = differs[top - around.start :][: last - top]
         for render in (here, there):
             render.unload()
@@ -130,48 +130,41 @@ def _finite(values: Array) -> Array:
     return np.where(np.isfinite(values), values, np.float32(0))
 
 
-def _at_places(
-    render: ReadableRender, names: Sequence[str], area: Window, vectors: Array, known: Mask
-) -> tuple[dict[str, Array], Mask]:
-    """Read layers at the pixels that vectors of an area lead to; and which vectors are known and end in the frame."""
-    window = render.data_window
-    x = np.arange(area.x0, area.x1, dtype=np.float32) + vectors[..., 0]
-    y = np.arange(area.y0, area.y1, dtype=np.float32)[:, None] + vectors[..., 1]
-    inside = (x > window.x0 - 0.5) & (x < window.x1 - 0.5) & (y > window.y0 - 0.5) & (y < window.y1 - 0.5) & known
-    ends = (np.floor(y[inside].min()), np.ceil(y[inside].max())) if inside.any() else (window.y0, window.y0)
-    first, last = (min(max(int(end), window.y0), window.y1 - 1) for end in ends)
-    place = Window(window.x0, first, window.x1, last + 1)
-    nearest = nearest_indices(x - place.x0, y - place.y0, (place.height, place.width))
-    layers = {}
-    for name, image in render.read(place, names).items():
-        planes = np.stack([plane.ravel().take(nearest, mode="clip") for plane in planes_of(image)])
-        layers[name] = np.moveaxis(planes, 0, -1)
-    return layers, inside
-
-
-def _differ(here: Mapping[str, Array], there: Mapping[str, Array], compared: Mask, turn: float) -> Mask:
-    """Find the pixels (h, w) where layers (h, w, c) show another surface, and those beside them.
+def _differ(
+    here: Mapping[str, Array], there: ReadableRender, area: Window, vectors: Array, known: Mask, turn: float
+) -> Mask:
+    """Find the pixels (h, w) of an area where layers (c, h, w) show another surface, and those beside them.
 
     Normals may change by ``turn``.
     """
-    height, width = compared.shape
-    result = np.empty((height, width), np.bool_)
+    window = there.data_window
+    ends = (np.arange(area.y0, area.y1, dtype=np.float32)[:, None] + vectors[..., 1])[known]
+    first, last = (np.floor(ends.min()), np.ceil(ends.max())) if len(ends) else (window.y0, window.y0)
+    first, last = (min(max(int(end), window.y0), window.y1 - 1) for end in (first, last))
+    place = Window(window.x0, first, window.x1, last + 1)
+    others = {name: planes_of(image) for name, image in there.read(place, list(here)).items()}
+    result = np.empty(known.shape, np.bool_)
 
     def work(rows: slice) -> None:
-        first, last, _ = rows.indices(height)
-        around = slice(max(first - REACH, 0), min(last + REACH, height))
-        other = np.zeros((around.stop - around.start, width), np.bool_)
-        for name, image in here.items():
-            one, two = (_finite(np.moveaxis(x[around], -1, 0)) for x in (image, there[name]))
-            differs = _differing(one, two, turn if name == NORMAL else DIFFERENCE, compared[around])
+        around = slice(max(rows.start - REACH, 0), min(rows.stop + REACH, area.height))
+        x = np.arange(area.x0, area.x1, dtype=np.float32) + vectors[around, :, 0]
+        y = np.arange(area.y0, area.y1, dtype=np.float32)[around, None] + vectors[around, :, 1]
+        inside = (x > window.x0 - 0.5) & (x < window.x1 - 0.5) & (y > window.y0 - 0.5) & (y < window.y1 - 0.5)
+        compared = inside & known[around]
+        nearest = nearest_indices(x - place.x0, y - place.y0, (place.height, place.width))
+        other = np.zeros(compared.shape, np.bool_)
+        for name, planes in here.items():
+            moved = np.stack([plane.ravel().take(nearest, mode="clip") for plane in others[name]])
+            least = turn if name == NORMAL else DIFFERENCE
+            differs = _differing(_finite(planes[:, around]), _finite(moved), least, compared)
             if differs.any():
                 other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
         if other.any():
             other |= means_around(other.astype(np.float32), [AROUND])[0] > MOST
             other = grown(other)
-        result[rows] = other[first - around.start :][: last - first]
+        result[rows] = other[rows.start - around.start :][: rows.stop - rows.start]
 
-    for_row_blocks(work, height, width)
+    for_row_blocks(work, area.height, area.width)
     return result
 
 

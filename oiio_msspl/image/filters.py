@@ -40,6 +40,12 @@ def box_downsample(image: NDArray[Any], scale: int) -> Array:
     return result
 
 
+def halved(image: Array) -> Array:
+    """Return the mean of 2 x 2 pixels (h/2, w/2, ...), rounded up: the last row and column of an odd size repeat."""
+    margins = [(0, side % 2) if axis < 2 else (0, 0) for axis, side in enumerate(image.shape)]
+    return box_downsample(np.pad(image, margins, mode="edge") if margins[0][1] or margins[1][1] else image, 2)
+
+
 def even_and_odd(plane: Array) -> tuple[Array, Array]:
     """Return two pictures of one (h, w, ...), by its even and by its odd pixels, as on a chessboard.
 
@@ -83,8 +89,7 @@ def interpolate(values: Array, positions: NDArray[np.float64], axis: int) -> Arr
 
 def enlarged(image: Array, scale: int) -> Array:
     """Interpolate an image (h, w, c) linearly at ``scale`` times its resolution."""
-    rows = slice(0, len(image))
-    return np.stack([upsample_linear(plane, scale, rows) for plane in planes_of(image)], axis=-1)
+    return np.stack([upsample_linear(plane, scale) for plane in planes_of(image)], axis=-1)
 
 
 def filled(image: Array, missing: NDArray[np.bool_]) -> Array:
@@ -105,16 +110,22 @@ def filled(image: Array, missing: NDArray[np.bool_]) -> Array:
     return np.where(missing[..., None], around, image)
 
 
-def upsample_linear(plane: Array, scale: int, rows: slice) -> Array:
-    """Interpolate the rows ``rows`` of a plane (h, w) linearly at ``scale`` times its resolution."""
-    padded = np.pad(plane, ((1, 1), (0, 0)), mode="edge")
-    tall = np.empty(((rows.stop - rows.start) * scale, plane.shape[1]), np.float32)
-    before, here, after = (padded[rows.start + i : rows.stop + i] for i in range(3))
-    _interleave(before, here, after, [tall[phase::scale] for phase in range(scale)])
-    padded = np.pad(tall, ((0, 0), (1, 1)), mode="edge")
-    result = np.empty((len(tall), plane.shape[1] * scale), np.float32)
-    before, here, after = (padded[:, i : i + plane.shape[1]] for i in range(3))
-    _interleave(before, here, after, [result[:, phase::scale] for phase in range(scale)])
+def upsample_linear(plane: Array, scale: int, rows: slice | None = None) -> Array:
+    """Interpolate a plane (h, w), or some of its rows, linearly at ``scale`` times its resolution."""
+    height, width = plane.shape
+    first, last, _ = (rows or slice(None)).indices(height)
+    result = np.empty(((last - first) * scale, width * scale), np.float32)
+
+    def work(part: slice) -> None:
+        top, bottom = first + part.start - 1, first + part.stop + 1
+        margins = (max(-top, 0), max(bottom - height, 0)), (1, 1)
+        padded = np.pad(plane[max(top, 0) : bottom], margins, mode="edge")
+        tall = np.empty(((part.stop - part.start) * scale, width + 2), np.float32)
+        out = result[part.start * scale : part.stop * scale]
+        _interleave(padded[:-2], padded[1:-1], padded[2:], [tall[phase::scale] for phase in range(scale)])
+        _interleave(tall[:, :-2], tall[:, 1:-1], tall[:, 2:], [out[:, phase::scale] for phase in range(scale)])
+
+    for_row_blocks(work, last - first, width * scale**2)
     return result
 
 
@@ -122,8 +133,9 @@ def _interleave(before: Array, here: Array, after: Array, phases: Sequence[Array
     """Fill the lines of an enlarged plane that lie in the lines ``here``."""
     for phase, lines in enumerate(phases):
         position = (phase + 0.5) / len(phases) - 0.5
-        nearest = before if position < 0 else after
-        lines[:] = here + np.float32(abs(position)) * (nearest - here)
+        change = (before if position < 0 else after) - here
+        change *= np.float32(abs(position))
+        np.add(here, change, out=lines)
 
 
 def neighbours(values: NDArray[Any]) -> Iterator[NDArray[Any]]:
@@ -241,7 +253,8 @@ def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
                 (np.minimum(places + reach + 1, size) - np.maximum(places - reach, 0)).astype(np.float32)
                 for places, size in ((np.arange(rows.start, rows.stop), height), (np.arange(width), width))
             )
-            np.divide(sums, lines[:, None] * columns, out=result[rows])
+            counts = lines[:, None] * columns if lines.min() < lines.max() else lines[0] * columns
+            np.divide(sums, counts, out=result[rows])
 
     for_row_blocks(work, height, 2 * width)
     return results

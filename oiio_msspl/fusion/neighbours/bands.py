@@ -74,7 +74,7 @@ def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
 def from_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
     """Interpolate a plane over :func:`grid_window` of ``area`` at full resolution, (h, w) over ``area``."""
     whole = _whole_pixels(alignment, area)
-    return upsample_linear(plane, alignment.scale, slice(0, len(plane)))[area.slices(whole)]
+    return upsample_linear(plane, alignment.scale)[area.slices(whole)]
 
 
 def _whole_pixels(alignment: Alignment, area: Window) -> Window:

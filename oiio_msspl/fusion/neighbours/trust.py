@@ -26,7 +26,7 @@ from oiio_msspl.fusion.neighbours.bands import grid_window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.colour import luminance
-from oiio_msspl.image.filters import box_downsample, grown, max_3x3, means_around, sum_3x3, upsample_linear
+from oiio_msspl.image.filters import grown, halved, max_3x3, means_around, sum_3x3, upsample_linear
 
 #: Side of the smallest cells that are judged, in HRLS pixels, unless LRHS pixels are larger; and side of the smallest
 #: that are judged over the whole frame, and not in bands of rows.
@@ -102,14 +102,14 @@ class Light(ABC):
         light = copy(self)
         light._halvings, light.cell = self._halvings + 1, self.cell * 2
         light._steps, light._share = self._steps - 1, self._share * 4
-        light._brightness, light._noise = _halved(self._brightness), _halved(self._noise) * np.float32(1 / 4)
+        light._brightness, light._noise = halved(self._brightness), halved(self._noise) * np.float32(1 / 4)
         light.shape = light._noise.shape
         return light
 
     def cells(self, image: Array) -> Array:
         """Average an image over the grid (h, w, ...) to cells."""
         for _ in range(self._halvings):
-            image = _halved(image)
+            image = halved(image)
         return image
 
     @abstractmethod
@@ -146,7 +146,7 @@ class Light(ABC):
         first = rows.start * self.alignment.scale // (COARSE // 2)
         trust = _Cells(low, high, deviation, self._noise[parts], self._share).trust(self._steps - 1, coarse[first:])
         if self._halvings:
-            trust = upsample_linear(trust, 1 << self._halvings, slice(0, len(trust)))[:height, :width]
+            trust = upsample_linear(trust, 1 << self._halvings)[:height, :width]
         lights = [luminance(image) for image in neighbour]
         least, most = _bounds(lights[0], lights[-1])
         lamps = self._least[rows] > np.float32(LAMP) * (most + np.float32(self.darkest))
@@ -170,7 +170,7 @@ class Light(ABC):
         cells = _Cells(low * valid[..., None], high * valid[..., None], deviation, self._noise, self._share)
         for _ in range(self._steps):
             cells = cells.halved()
-        return _doubled(cells.trust())
+        return upsample_linear(cells.trust(), 2)
 
 
 class RenderLight(Light):
@@ -188,7 +188,7 @@ class RenderLight(Light):
     def coarser(self) -> Self:
         """Return the same light with cells of twice the size."""
         light = super().coarser()
-        light._renders = _halved(self._renders[0]), _halved(self._renders[1])
+        light._renders = halved(self._renders[0]), halved(self._renders[1])
         return light
 
     def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
@@ -222,7 +222,7 @@ class ResultLight(Light):
     def coarser(self) -> Self:
         """Return the same light with cells of twice the size."""
         light = super().coarser()
-        light._picture, light._doubt = _halved(self._picture), _halved(self._doubt)
+        light._picture, light._doubt = halved(self._picture), halved(self._doubt)
         return light
 
     def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
@@ -247,8 +247,8 @@ class _Cells:
     def halved(self) -> _Cells:
         """Return cells of twice the size."""
         most, quarter = MOST_SAID * np.sqrt(self.deviation)[..., None], np.float32(1 / 4)
-        low, high = (_halved(np.clip(difference, -most, most)) for difference in (self.low, self.high))
-        deviation, noise = (_halved(plane) * quarter for plane in (self.deviation, self.noise))
+        low, high = (halved(np.clip(difference, -most, most)) for difference in (self.low, self.high))
+        deviation, noise = (halved(plane) * quarter for plane in (self.deviation, self.noise))
         return _Cells(low, high, deviation, noise, self.share * 4)
 
     def trust(self, steps: int = 99, coarse: Array | None = None) -> Array:
@@ -259,7 +259,7 @@ class _Cells:
             coarse: what even larger cells say, (h, w) or more rows.
         """
         if steps and min(self.noise.shape) > 1:
-            coarse = _doubled(self.halved().trust(steps - 1, coarse))
+            coarse = upsample_linear(self.halved().trust(steps - 1, coarse), 2)
         height, width = self.noise.shape
         trust = np.ones_like(self.noise) if coarse is None else coarse[:height, :width]
         own_error = self.noise * np.float32(min(self.share, 1)) + np.float32(EQUAL)
@@ -272,16 +272,6 @@ class _Cells:
             )
             trust = np.clip(trust, least, most)
         return trust
-
-
-def _doubled(plane: Array) -> Array:
-    return upsample_linear(plane, 2, slice(0, len(plane)))
-
-
-def _halved(image: Array) -> Array:
-    """Return the means of 2 x 2 cells (h/2, w/2, ...), rounded up."""
-    margins = [(0, side % 2) if axis < 2 else (0, 0) for axis, side in enumerate(image.shape)]
-    return box_downsample(np.pad(image, margins, mode="edge") if margins[0][1] or margins[1][1] else image, 2)
 
 
 def _noise(lrhs: Array, hrls: Array, brightness: Array) -> Array:

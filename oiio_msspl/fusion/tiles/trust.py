@@ -1,31 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gives back what both renders show and the network has removed.
 
-Where the renders have many samples, a network erases detail that no AOV shows. The difference between the HRLS and the
-fused picture is noise and lost detail. The pair tells them apart: both renders are independent, so the difference of
-the LRHS to the means of the HRLS is the noise of the two. Where the fused picture differs by more than that noise
-explains, a part of the difference is put back, as much as James and Stein's estimator keeps (Gu et al. 2022,
-*Neural James-Stein Combiner*, without a network). The picture may have kept a part of the HRLS's noise. So the LRHS is
-asked as well: what both renders show at an LRHS pixel and the picture lacks is detail. A test of significance decides
-first, so that chance and fireflies are not taken for detail (Firmino et al. 2022, *Progressive Denoising of Monte Carlo
-Rendered Images*).
+Both renders are independent, so their difference is noise alone. Where the picture differs from a render by more than
+that noise, a part of the difference is put back: as much as James and Stein's estimator keeps, after a test of
+significance (Gu et al. 2022, *Neural James-Stein Combiner*, here without a network; Firmino et al. 2022, *Progressive
+Denoising of Monte Carlo Rendered Images*). ``docs/design/trust.md`` has the steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 
 from oiio_msspl.image.arrays import Array, Mask, planes_of
-from oiio_msspl.image.filters import blurred, box_downsample, max_around, means_around, upsample_linear
-from oiio_msspl.image.parallel import for_row_blocks, in_parallel, two_at_a_time
+from oiio_msspl.image.filters import blurred, box_downsample, halved, max_around, means_around, upsample_linear
+from oiio_msspl.image.parallel import for_row_blocks, two_at_a_time
 
-#: Reach of the windows in which energies are compared, in LRHS pixels. Large windows find faint detail, small ones find
-#: where it ends. They hold fewer pixels, but also fewer kinds of noise.
-WINDOWS = (3, 7, 15)
+#: Reach of the windows in which energies are compared, in cells of each level; and how many levels there are: of cells
+#: of 1, 2 and 4 LRHS pixels. Large windows find faint detail, small ones find where it ends. They hold fewer pixels,
+#: but also fewer kinds of noise.
+WINDOW, LEVELS = 4, 3
 #: The t up to which a difference is taken for noise, and the one that leaves no doubt.
 DOUBTFUL, CERTAIN = np.float32(3), np.float32(5)
 #: Exposed radiance that is added to the local brightness, so that dark noise does not count as much as light.
@@ -37,8 +33,8 @@ LARGEST = 16.0
 #: around: a lamp alone.
 AGREED, ALONE = (0.4, 0.7), 16.0
 #: Squared relative difference that is too small for a point, and amplitude without agreement that counts as well: a few
-#: dim points may agree by chance.
-POINT, DOUBT = 0.1, 4.0
+#: dim points may agree by chance. ``AROUND`` is how far "around" reaches, in LRHS pixels.
+POINT, DOUBT, AROUND = 0.1, 4.0, 15
 #: Share of the pixels of a window that are darker than the picture if light may be missing.
 MOSTLY = 0.6
 #: Noise counts this many times where a pixel is judged by itself.
@@ -47,8 +43,9 @@ PIXEL = 4.0
 BRIGHTEST = np.float32(1e6)
 #: Error of a half float, relative to its value.
 ROUNDING = 2.0**-12
-#: Reach of the windows of the light's correction, in pixels of each level, and its largest factor.
-LIGHT_REACH, LARGEST_FACTOR = 3, 2.0
+#: Reach of the windows of the light's correction, in cells of each level, and its largest factor. The smallest cells
+#: have this side in HRLS pixels, unless LRHS pixels are larger.
+LIGHT_REACH, LARGEST_FACTOR, CELL = 3, 2.0, 4
 #: Pixels do not count for the light around them if both renders are brighter by this many times the local brightness:
 #: a lamp that the network has removed.
 LAMP = 1.0
@@ -95,22 +92,23 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     if scale == 1:
         render = render + np.float32(renders.share) * (low - render)
     light = list(zip(own, lrhs, means, strict=True))
-    factors = two_at_a_time(lambda planes: _light_factor(*planes, renders.share, reach), light)
-    picture = np.stack([_multiplied(*planes) for planes in zip(picture, factors, strict=True)])
+    factors = two_at_a_time(lambda planes: _light_factor(*planes, renders.share, scale, reach), light)
     own = [plane * factor for plane, factor in zip(own, factors, strict=True)]
-    energy, darker, brightness = _difference(picture, render, scale, exposure)
+    relative = len(picture) * np.square(_brightness(reduce(np.add, own) / np.float32(len(own))))
+    picture = np.stack([plane * upsample_linear(factor, scale) for plane, factor in zip(picture, factors, strict=True)])
     # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of
     # the mean of both renders is E d^2 share (1 - share).
     variance = np.float32(renders.share * (scale**2 if scale > 1 else 1 - renders.share))
     noise = variance * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
-    relative = len(picture) * np.square(brightness)
     target = means if scale > 1 else [_exposed(plane, exposure) for plane in render]
+    darker = reduce(np.add, (best - mine for best, mine in zip(target, own, strict=True))) < 0
     common = reduce(np.add, ((a - mine) * (b - mine) for a, b, mine in zip(lrhs, means, own, strict=True)))
     change = reduce(np.add, (np.square(best - mine) for best, mine in zip(target, own, strict=True)))
+    energy = _squared_difference(picture, render, scale, exposure) if scale > 1 else change
     energy, noise, common, change = (values / relative for values in (energy, noise, common, change))
-    trust, points = _trust_in_detail(energy, noise, common, change, darker, scale, reach)
-    for plane, pixels in zip(picture, render, strict=True):
-        _blend(plane, pixels, trust, points)
+    points = _trust_in_points(energy, noise, darker, scale, reach)
+    trust = np.maximum(_trust_in_areas(energy, noise, common, change, darker, scale, reach), points)
+    _blend(picture, render, trust, points)
     return np.moveaxis(picture, 0, -1), trust
 
 
@@ -120,26 +118,22 @@ def _exposed(plane: Array, exposure: np.float32) -> Array:
         return np.clip(plane * exposure, -BRIGHTEST, BRIGHTEST)
 
 
-def _difference(picture: Array, render: Array, scale: int, exposure: np.float32) -> tuple[Array, Mask, Array]:
-    """Compare planes (c, s*h, s*w) at the LRHS's resolution, in exposed units.
+def _squared_difference(picture: Array, render: Array, scale: int, exposure: np.float32) -> Array:
+    """Return the squared difference of planes (c, s*h, s*w), in exposed units: its mean in an LRHS pixel, (h, w)."""
+    result = np.empty((len(picture[0]) // scale, picture.shape[2] // scale), np.float32)
 
-    Returns:
-        The sum of the squared differences, where the render is darker, and the brightness of the picture, (h, w).
-    """
-    shape = len(picture[0]) // scale, picture.shape[2] // scale
-    energy, excess, mean = (np.zeros(shape, np.float32) for _ in range(3))
-    for plane, pixels in zip(picture, render, strict=True):
-        difference = _exposed(pixels - plane, exposure)
-        excess += box_downsample(difference, scale)
-        energy += box_downsample(np.square(difference, out=difference), scale)
-        mean += _exposed(box_downsample(plane, scale), exposure) / np.float32(len(picture))
-    return energy, excess < 0, _brightness(mean)
+    def work(rows: slice) -> None:
+        squares = (np.square(_exposed(a[rows] - b[rows], exposure)) for a, b in zip(render, picture, strict=True))
+        result[rows.start // scale : rows.stop // scale] = box_downsample(reduce(np.add, squares), scale)
+
+    for_row_blocks(work, picture.shape[1], picture.shape[2], multiple=scale)
+    return result
 
 
-def _trust_in_detail(
+def _trust_in_areas(
     energy: Array, noise: Array, common: Array, change: Array, darker: Mask, scale: int, reach: int
-) -> tuple[Array, Array]:
-    """Return how much of a difference is detail, (h, w) in [0, 1], and the part that is judged pixel by pixel.
+) -> Array:
+    """Return how much of a difference is detail by the means of windows, (h, w) in [0, 1].
 
     Args:
         energy, noise: squared difference to the render that is put back, and the part of it that noise explains; these
@@ -149,71 +143,59 @@ def _trust_in_detail(
         darker: the renders are darker than the picture.
         scale, reach: as in :func:`trust_renders`.
     """
-    sizes = [size for size in WINDOWS if 2 * size <= reach] or [WINDOWS[0]]
-    most = np.float32(LARGEST * scale**2)
-    # Most windows lack rare light.
-    dark = [share > MOSTLY for share in means_around(darker.astype(np.float32), sizes)]
-    areas, both = in_parallel(
-        lambda: _trust_in_areas(energy, noise, dark, most, sizes),
-        lambda: _trust_of_both(common, change, darker, dark, sizes),
-    )
-    points = _trust_in_points(energy, noise, darker, most, sizes[-1])
-    return np.maximum(np.maximum(areas, both), points), points
-
-
-def _trust_in_areas(energy: Array, noise: Array, dark: Sequence[Mask], most: np.float32, sizes: Sequence[int]) -> Array:
-    """Return how much of a difference is detail by the means of windows, (h, w) in [0, 1].
-
-    Args:
-        energy, noise: squared difference, and the part of it that noise explains.
-        dark: most of a window is darker than the picture, for each size.
-        most: values are limited to this.
-        sizes: reaches of the windows.
-    """
-    # Windows that lack rare light lack the noise that it makes, too. So one that is darker has the noise of all around.
-    noise_around = means_around(noise, sizes[-1:])[0]
-    energy, noise = np.minimum(energy, most), np.minimum(noise, most)
-    energies, noises, squares = (means_around(x, sizes) for x in (energy, noise, np.square(energy) + np.square(noise)))
-    trust = np.zeros_like(energy)
-    for i, size in enumerate(sizes):
-        explained = np.where(dark[i], np.maximum(noises[i], noise_around), noises[i])
-        part = _certainty(energies[i] - explained, squares[i], size) * _kept(energies[i], explained)
-        np.maximum(trust, means_around(part, [size])[0], out=trust)
-    return trust
-
-
-def _trust_of_both(common: Array, change: Array, darker: Mask, dark: Sequence[Mask], sizes: Sequence[int]) -> Array:
-    """Return how much of a difference both renders agree on, (h, w) in [0, 1].
-
-    Their noise is independent, so the mean of the product of their differences to the picture is the square of its
-    error. Both agree that windows without rare light are dark. So a window that is darker also needs brighter pixels on
-    which they agree.
-
-    Args:
-        common, change, darker: as for :func:`_trust_in_detail`.
-        dark, sizes: as for :func:`_trust_in_areas`.
-    """
-    largest = np.float32(LARGEST)
+    levels = 1
+    while levels < LEVELS and 2 * WINDOW * 2**levels <= reach:
+        levels += 1
+    most, largest = np.float32(LARGEST * scale**2), np.float32(LARGEST)
+    energy, least = np.minimum(energy, most), np.minimum(noise, most)
     common, change = np.clip(common, -largest, largest), np.minimum(change, largest)
     lit: Array = np.where(darker, np.minimum(common, np.float32(0)), common)
-    means, changes, lights = (means_around(plane, sizes) for plane in (common, change, lit))
-    squares = means_around(common * common, sizes)
-    trust = np.zeros_like(common)
-    for i, size in enumerate(sizes):
-        least = np.where(dark[i], np.minimum(means[i], lights[i]), means[i])
-        part = _certainty(least, squares[i], size) * _kept(changes[i], changes[i] - means[i])
-        np.maximum(trust, means_around(part, [size])[0], out=trust)
+    squares, share = (np.square(energy) + np.square(least), common * common), darker.astype(np.float32)
+    trust, _ = _trust_in_windows([energy, least, common, change, lit, *squares, share, noise], levels)
     return trust
 
 
-def _trust_in_points(energy: Array, noise: Array, darker: Mask, most: np.float32, size: int) -> Array:
-    """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1].
+def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple[Array, Array]:
+    """Return how much of a difference is detail by windows of ``cells`` LRHS pixels a cell and by larger ones.
+
+    - By the HRLS: a difference that is larger than noise explains. Windows that lack rare light lack the noise that it
+      makes, too. So one that is darker has the noise of all around.
+    - By both renders: their noise is independent, so the mean of the product of their differences to the picture is the
+      square of its error. Both agree that windows without rare light are dark. So a window that is darker also needs
+      brighter pixels on which they agree.
 
     Args:
-        energy, noise, darker: as for :func:`_trust_in_areas`.
-        most: values that count for their surroundings are limited to this.
-        size: reach of the window around.
+        values: of each cell (h, w): energy, limited noise, common, change, common where it is not darker, squares of
+            energy and noise, squares of common, share that is darker, and noise.
+        levels: how many sizes of cells there are, from this one on.
+
+    Returns:
+        Trust (h, w) in [0, 1], and the noise of the largest windows.
     """
+    height, width = values[0].shape
+    if levels > 1:
+        larger = _trust_in_windows([halved(plane) for plane in values], levels - 1, 4 * cells)
+        coarser, noise_around = (_enlarge(plane, height, width) for plane in larger)
+    else:
+        coarser, noise_around = np.zeros_like(values[0]), means_around(values[-1], [WINDOW])[0]
+    means = two_at_a_time(lambda plane: means_around(plane, [WINDOW])[0], values[:-1])
+    energy, noise, common, change, lit, squares, squares_of_both, darker = means
+    dark, count = darker > MOSTLY, cells * (2 * WINDOW + 1) ** 2
+    noise = np.where(dark, np.maximum(noise, noise_around), noise)
+    least = np.where(dark, np.minimum(common, lit), common)
+    part = np.maximum(
+        _certainty(energy - noise, squares, count) * _kept(energy, noise),
+        _certainty(least, squares_of_both, count) * _kept(change, change - common),
+    )
+    return np.maximum(coarser, means_around(part, [WINDOW])[0]), noise_around
+
+
+def _trust_in_points(energy: Array, noise: Array, darker: Mask, scale: int, reach: int) -> Array:
+    """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1].
+
+    The arguments are those of :func:`_trust_in_areas`.
+    """
+    size, most = min(AROUND, reach // 2), np.float32(LARGEST * scale**2)
     light = np.where(darker, np.float32(0), energy)
     kept, amplitude = _kept(light, np.float32(PIXEL) * noise), np.sqrt(np.clip(light - np.float32(POINT), 0, most))
     agreed, total = (means_around(x, [size])[0] for x in (amplitude * kept, amplitude))
@@ -224,15 +206,15 @@ def _trust_in_points(energy: Array, noise: Array, darker: Mask, most: np.float32
     return is_point * np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
 
 
-def _certainty(excess: Array, squares: Array, size: int) -> Array:
+def _certainty(excess: Array, squares: Array, count: int) -> Array:
     """Return how certain it is that the mean of a window exceeds 0: 0 up to ``DOUBTFUL``, 1 from ``CERTAIN`` on.
 
     Args:
         excess: the mean.
         squares: the mean of the values' squares.
-        size: reach of the window.
+        count: values in the window.
     """
-    error = np.sqrt(np.maximum(squares, 0) / np.float32((2 * size + 1) ** 2))
+    error = np.sqrt(np.maximum(squares, 0) / np.float32(count))
     t = excess / np.maximum(error, np.float32(1e-12))
     return np.clip((t - DOUBTFUL) / (CERTAIN - DOUBTFUL), 0, 1)
 
@@ -253,22 +235,23 @@ def _squared_noise(lrhs: Array, mean: Array) -> Array:
 
 
 def _blend(picture: Array, render: Array, trust: Array, points: Array) -> None:
-    """Add a part of its difference to a render to a picture, planes (s*h, s*w).
+    """Add a part of its difference to a render to a picture, planes (c, s*h, s*w).
 
     The part is ``trust`` (h, w), interpolated, and at least ``points`` (h, w) over a whole LRHS pixel.
     """
-    scale = len(render) // len(trust)
+    (height, width), scale = render.shape[1:], render.shape[1] // len(trust)
 
     def work(rows: slice) -> None:
         place = slice(rows.start // scale, rows.stop // scale)
         weight = upsample_linear(trust, scale, place)
         np.maximum(weight, points[place].repeat(scale, axis=0).repeat(scale, axis=1), out=weight)
-        picture[rows] += weight * (render[rows] - picture[rows])
+        for plane, pixels in zip(picture[:, rows], render[:, rows], strict=True):
+            plane += weight * (pixels - plane)
 
-    for_row_blocks(work, len(render), render.shape[1], multiple=scale)
+    for_row_blocks(work, height, width, multiple=scale)
 
 
-def _light_factor(own: Array, lrhs: Array, mean: Array, share: float, reach: int) -> Array:
+def _light_factor(own: Array, lrhs: Array, mean: Array, share: float, scale: int, reach: int) -> Array:
     """Return the factor (h, w) that gives a picture the light of both renders where they agree that it differs.
 
     The differences of the renders to the picture's ``own`` means are divided into levels of resolution, and each is
@@ -278,24 +261,16 @@ def _light_factor(own: Array, lrhs: Array, mean: Array, share: float, reach: int
     low, high = (lrhs - own) / brightness, (mean - own) / brightness
     lamps = np.minimum(low, high) > LAMP
     low[lamps] = high[lamps] = 0
+    cell = 1
+    while cell * scale < CELL:
+        low, high, cell = halved(low), halved(high), 2 * cell
     levels = 1
-    while LIGHT_REACH * 2 ** (levels + 1) <= reach:
+    while LIGHT_REACH * 2 ** (levels + 1) * cell <= reach:
         levels += 1
-    change = brightness * _agreed(low, high, np.float32(share), levels) / np.maximum(own, 0.01 * brightness)
+    height, width = own.shape
+    agreed = upsample_linear(_agreed(low, high, np.float32(share), levels), cell)[:height, :width]
+    change = brightness * agreed / np.maximum(own, 0.01 * brightness)
     return np.clip(1 + change, 1 / LARGEST_FACTOR, LARGEST_FACTOR).astype(np.float32)
-
-
-def _multiplied(picture: Array, factor: Array) -> Array:
-    """Return a picture (s*h, s*w) times a factor (h, w), which is interpolated."""
-    scale = len(picture) // len(factor)
-    result = np.empty_like(picture)
-
-    def work(rows: slice) -> None:
-        place = slice(rows.start // scale, rows.stop // scale)
-        np.multiply(picture[rows], upsample_linear(factor, scale, place), out=result[rows])
-
-    for_row_blocks(work, len(picture), picture.shape[1], multiple=scale)
-    return result
 
 
 def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:
@@ -306,22 +281,22 @@ def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:
     height, width = low.shape
     coarser = np.zeros_like(low)
     if levels > 1 and min(height, width) >= 8:
-        margins = [(0, side % 2) for side in low.shape]
-        half_low, half_high = (box_downsample(np.pad(plane, margins, "edge"), 2) for plane in (low, high))
+        half_low, half_high = halved(low), halved(high)
         coarser = _enlarge(_agreed(half_low, half_high, share, levels - 1), height, width)
         low, high = low - _enlarge(half_low, height, width), high - _enlarge(half_high, height, width)
     mean = high + share * (low - high)
     most = np.float32(LARGEST)
-    near, around = [LIGHT_REACH], [4 * LIGHT_REACH]
-    squares_around = means_around(np.square(low * high), around)[0]
-    product = np.clip(low * high, -most, most)
+    near, product = [LIGHT_REACH], low * high
+    # Over four times the reach, in cells of twice the size.
+    squares_around = _enlarge(means_around(halved(np.square(product)), [2 * LIGHT_REACH])[0], height, width)
+    product = np.clip(product, -most, most)
     common, squares, energy = (means_around(plane, near)[0] for plane in (product, product * product, mean * mean))
     # Most windows lack rare light.
     squares = np.where(mean < 0, np.maximum(squares, squares_around), squares)
-    shrink = _certainty(common, squares, LIGHT_REACH) * _kept(energy, energy - common)
+    shrink = _certainty(common, squares, (2 * LIGHT_REACH + 1) ** 2) * _kept(energy, energy - common)
     return mean * means_around(shrink, near)[0] + coarser
 
 
 def _enlarge(half: Array, height: int, width: int) -> Array:
     """Return a plane at twice its resolution, without the row or column that made its size even."""
-    return upsample_linear(half, 2, slice(0, len(half)))[:height, :width]
+    return upsample_linear(half, 2)[:height, :width]

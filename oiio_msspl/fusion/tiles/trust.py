@@ -29,12 +29,12 @@ DARKEST = 0.02
 #: Squared difference relative to the local brightness, and to s^2, that counts at most: a firefly is one pixel.
 LARGEST = 16.0
 #: A pixel is judged by itself where the renders agree on this share of all brighter differences around: scattered
-#: points. Fireflies agree by chance alone. It is also judged where its energy is this many times the largest noise
+#: points. On fireflies they agree nowhere. It is also judged where its energy is this many times the largest noise
 #: around: a lamp alone.
-AGREED, ALONE = (0.4, 0.7), 16.0
-#: Squared relative difference that is too small for a point, and amplitude without agreement that counts as well: a few
-#: dim points may agree by chance. ``AROUND`` is how far "around" reaches, in LRHS pixels.
-POINT, DOUBT, AROUND = 0.1, 4.0, 15
+AGREED, ALONE = (0.3, 0.6), 16.0
+#: Squared relative difference that is too small for a point, and the sum of those without agreement that counts as
+#: well: a few points may agree by chance. ``AROUND`` is how far "around" reaches, in LRHS pixels.
+POINT, DOUBT, AROUND = 0.1, 8.0, 15
 #: Share of the pixels of a window that are darker than the picture if light may be missing.
 MOSTLY = 0.6
 #: Noise counts this many times where a pixel is judged by itself.
@@ -106,7 +106,7 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     change = reduce(np.add, (np.square(best - mine) for best, mine in zip(target, own, strict=True)))
     energy = _squared_difference(picture, render, scale, exposure) if scale > 1 else change
     energy, noise, common, change = (values / relative for values in (energy, noise, common, change))
-    points = _trust_in_points(energy, noise, darker, scale, reach)
+    points = _trust_in_points(energy, noise, common, change, darker, reach)
     trust = np.maximum(_trust_in_areas(energy, noise, common, change, darker, scale, reach), points)
     _blend(picture, render, trust, points)
     return np.moveaxis(picture, 0, -1), trust
@@ -190,15 +190,18 @@ def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple
     return np.maximum(coarser, means_around(part, [WINDOW])[0]), noise_around
 
 
-def _trust_in_points(energy: Array, noise: Array, darker: Mask, scale: int, reach: int) -> Array:
+def _trust_in_points(energy: Array, noise: Array, common: Array, change: Array, darker: Mask, reach: int) -> Array:
     """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1].
 
     The arguments are those of :func:`_trust_in_areas`.
     """
-    size, most = min(AROUND, reach // 2), np.float32(LARGEST * scale**2)
-    light = np.where(darker, np.float32(0), energy)
-    kept, amplitude = _kept(light, np.float32(PIXEL) * noise), np.sqrt(np.clip(light - np.float32(POINT), 0, most))
-    agreed, total = (means_around(x, [size])[0] for x in (amplitude * kept, amplitude))
+    size, zero = min(AROUND, reach // 2), np.float32(0)
+    light, brighter = (np.where(darker, zero, values) for values in (energy, change))
+    # Limited by one factor: chance agrees on a small share of a firefly. In most pixels with little noise both renders
+    # are brighter than the mean, and so agree by chance. They disagree where one of them is dark.
+    weight = np.float32(LARGEST) / np.maximum(change, np.float32(LARGEST))
+    common = np.where(darker, np.minimum(common, zero), common)
+    agreed, total = (means_around(weight * values, [size])[0] for values in (common, brighter))
     share = agreed / (total + np.float32(DOUBT / (2 * size + 1) ** 2))
     scattered = np.clip((share - AGREED[0]) / (AGREED[1] - AGREED[0]), 0, 1)
     alone = _kept(light, np.float32(ALONE) * max_around(noise, size))
@@ -259,8 +262,9 @@ def _light_factor(own: Array, lrhs: Array, mean: Array, share: float, scale: int
     """
     brightness = _brightness(own)
     low, high = (lrhs - own) / brightness, (mean - own) / brightness
-    lamps = np.minimum(low, high) > LAMP
-    low[lamps] = high[lamps] = 0
+    # Chosen by the other render, or rare light would lose the samples that both have found.
+    in_low, in_high = low > LAMP, high > LAMP
+    low[in_high] = high[in_low] = 0
     cell = 1
     while cell * scale < CELL:
         low, high, cell = halved(low), halved(high), 2 * cell

@@ -157,3 +157,25 @@ def test_light_that_few_samples_find_stays(scale: int, ambient: float) -> None:
     result, _ = trust_renders(truth, Renders(lrhs, render(SIZE, 1) * truth, 0.5, 1.0), REACH)
     assert rms(result, truth) < 0.05
     assert result.min() > 0.5 * truth.min()
+
+
+def test_light_that_both_renders_find_in_the_same_pixels_by_chance_is_not_lost() -> None:
+    """With 16 samples that find it once in 50, a quarter of the pixels has light, and one in 13 in both renders."""
+    truth, rng = wall(), np.random.default_rng(1)
+    first, second = (truth * (rng.binomial(16, 0.02, (SIZE, SIZE, 1)) / 0.32).astype(np.float32) for _ in range(2))
+    result, _ = trust_renders(truth, Renders(first, second, 0.5, 1.0), REACH)
+    assert result.mean() == pytest.approx(truth.mean(), rel=0.02)
+
+
+@pytest.mark.parametrize("lit", [0.3, 0.5, 0.7, 0.9])
+def test_two_noisy_renders_do_not_agree_on_points(lit: float) -> None:
+    """A sample is lit or in shadow, so that two often have the same light."""
+    truth, rng = wall(), np.random.default_rng(1)
+
+    def render(spp: int) -> Array:
+        samples = (rng.random((spp, SIZE, SIZE)) < lit) * rng.gamma(100, 1 / 100, (spp, SIZE, SIZE)) / lit
+        return truth * samples.mean(axis=0)[..., None].astype(np.float32)
+
+    result, trust = trust_renders(truth, Renders(render(1), render(2), 1 / 3, 1.0), REACH)
+    assert rms(result, truth) < 0.02
+    assert trust.mean() < 0.002

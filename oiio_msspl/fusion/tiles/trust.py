@@ -106,7 +106,7 @@ def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Ar
     change = reduce(np.add, (np.square(best - mine) for best, mine in zip(target, own, strict=True)))
     energy = _squared_difference(picture, render, scale, exposure) if scale > 1 else change
     energy, noise, common, change = (values / relative for values in (energy, noise, common, change))
-    points = _trust_in_points(energy, noise, common, change, darker, reach)
+    points = _trust_in_points(energy, noise, common, change, darker, scale, reach)
     trust = np.maximum(_trust_in_areas(energy, noise, common, change, darker, scale, reach), points)
     _blend(picture, render, trust, points)
     return np.moveaxis(picture, 0, -1), trust
@@ -190,17 +190,21 @@ def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple
     return np.maximum(coarser, means_around(part, [WINDOW])[0]), noise_around
 
 
-def _trust_in_points(energy: Array, noise: Array, common: Array, change: Array, darker: Mask, reach: int) -> Array:
+def _trust_in_points(
+    energy: Array, noise: Array, common: Array, change: Array, darker: Mask, scale: int, reach: int
+) -> Array:
     """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1].
 
     The arguments are those of :func:`_trust_in_areas`.
     """
     size, zero = min(AROUND, reach // 2), np.float32(0)
     light, brighter = (np.where(darker, zero, values) for values in (energy, change))
-    # Limited by one factor: chance agrees on a small share of a firefly. In most pixels with little noise both renders
-    # are brighter than the mean, and so agree by chance. They disagree where one of them is dark.
+    # A firefly of the LRHS counts no more than the HRLS. The mean of two renders of one size tells nothing of what only
+    # one of them has. In most pixels with little noise both are brighter than the mean, and so agree by chance. They
+    # disagree where one of them is dark.
+    least = change if scale > 1 else np.maximum(change, np.float32(LARGEST))
+    common = np.clip(common, -least, np.where(darker, zero, change))
     weight = np.float32(LARGEST) / np.maximum(change, np.float32(LARGEST))
-    common = np.where(darker, np.minimum(common, zero), common)
     agreed, total = (means_around(weight * values, [size])[0] for values in (common, brighter))
     share = agreed / (total + np.float32(DOUBT / (2 * size + 1) ** 2))
     scattered = np.clip((share - AGREED[0]) / (AGREED[1] - AGREED[0]), 0, 1)

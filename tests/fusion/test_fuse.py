@@ -665,6 +665,16 @@ def test_progress_counts_tiles(session, scale, monkeypatch):
     assert seen == [(i + 1, fused.tiles) for i in range(fused.tiles)]
 
 
+def test_a_firefly_of_the_lrhs_is_dimmed_to_what_the_hrls_allows(session, scale):
+    low, high, _ = pair_of(scale, 64 * scale, 64 * scale)
+    brightest = downsample(high.layers["rgb"], scale)[2:5, 2:5].max(axis=(0, 1))
+    low.layers["rgb"][3, 3] = FIREFLY_FACTOR * brightest
+    expected = fuse(low, high, session).rgb
+    low.layers["rgb"][3, 3] = 1e6
+    # The pixel changes the exposure, and with it the smallest channel of pure colours.
+    np.testing.assert_allclose(fuse(low, high, session).rgb, expected, rtol=0.05, atol=5e-4)
+
+
 def test_another_frames_albedo_is_noticed(session, scale):
     """Not the right one, though light and shadow have edges that it lacks."""
     rng = np.random.default_rng(1)

@@ -18,7 +18,6 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TileFeatures
 from oiio_msspl.image.arrays import FLOAT_MAX, Array, Mask, planes_of
 from oiio_msspl.image.filters import all_within, box_downsample, grown, max_3x3, means_around, neighbours
-from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
 
@@ -58,8 +57,9 @@ def dim_fireflies(tile: TileFeatures) -> tuple[Array, dict[str, Array]]:
     """
     lrhs_rgb, hrls = tile.lrhs[RGB], tile.hrls
     lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], tile.scale), tile)
-    hrls_limit = _brightness_limit(lrhs_rgb, tile)
-    dimmed = {name: _limit(hrls[name], hrls_limit, tile.scale) for name in RADIANCE_FEATURES if name in hrls}
+    limit = _over_hrls(_brightness_limit(lrhs_rgb, tile))
+    blocks = {name: _by_lrhs_pixel(hrls[name], tile.scale) for name in RADIANCE_FEATURES if name in hrls}
+    dimmed = {name: np.minimum(values, limit).reshape(hrls[name].shape) for name, values in blocks.items()}
     return np.minimum(lrhs_rgb, lrhs_limit), hrls | dimmed
 
 
@@ -99,6 +99,16 @@ def with_pure_colours(fused: Array, rgb: Array, mixed: Array, exposure: float) -
     return fused
 
 
+def _by_lrhs_pixel(hrls: Array, scale: int) -> Array:
+    """Return HRLS pixels (s*h, s*w, c) by their LRHS pixel, (h, s, w, s, c)."""
+    return hrls.reshape(len(hrls) // scale, scale, -1, scale, hrls.shape[-1])
+
+
+def _over_hrls(lrhs: Array) -> Array:
+    """Return LRHS pixels (h, w, c) for :func:`_by_lrhs_pixel`, (h, 1, w, 1, c): results then have its memory layout."""
+    return np.moveaxis(planes_of(lrhs), 0, -1)[:, None, :, None]
+
+
 def _least_channel(rgb: Array, exposure: float) -> Array:
     """Return what each channel of a pixel has at least for the network, (h, w, 1)."""
     bright, dazzling = (np.float32(min(value / exposure, FLOAT_MAX)) for value in (BRIGHT, DAZZLING))
@@ -109,19 +119,6 @@ def _least_channel(rgb: Array, exposure: float) -> Array:
 def _brightest(rgb: Array) -> Array:
     """Return the brightest channel of each pixel of an image (h, w, 3), (h, w, 1)."""
     return reduce(np.maximum, (rgb[..., channel : channel + 1] for channel in range(3)))
-
-
-def _limit(hrls: Array, limit: Array, scale: int) -> Array:
-    """Limit HRLS values (s*h, s*w, c) to the limit (h, w, c) of their LRHS pixel."""
-    result = np.empty_like(hrls)
-
-    def work(rows: slice) -> None:
-        limits = limit[rows.start // scale : rows.stop // scale]
-        for y, x in np.ndindex(scale, scale):
-            np.minimum(hrls[rows][y::scale, x::scale], limits, out=result[rows][y::scale, x::scale])
-
-    for_row_blocks(work, len(hrls), hrls[0].size, multiple=scale)
-    return result
 
 
 def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | None:
@@ -153,19 +150,13 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
         even = least + light / np.maximum(covered, np.float32(1 / scale**2))
         limit = np.maximum(max_3x3(lrhs_rgb), even)
         factor = np.nan_to_num(np.minimum(light / np.maximum(hrls_light, np.float32(1e-30)), 1))
-        blocks = hrls_rgb.reshape(len(lrhs_rgb), scale, -1, scale, 3)
+        blocks = _by_lrhs_pixel(hrls_rgb, scale)
         factor[(max_3x3(blocks.max(axis=(1, 3))) - least) * covered > 2 * hrls_light] = 0
         # The LRHS pixel must have light, too. Otherwise the HRLS pixel is a firefly beside a lamp.
         most = lrhs_rgb * np.float32(FIREFLY_FACTOR)
-    agreed = np.empty_like(hrls_rgb)
-
-    def work(rows: slice) -> None:
-        part, place = hrls_rgb[rows], slice(rows.start // scale, rows.stop // scale)
-        in_proportion = least + (part - least) * repeated(factor[place], scale)
-        bound = np.minimum(np.maximum(repeated(limit[place], scale), in_proportion), repeated(most[place], scale))
-        np.minimum(part, bound, out=agreed[rows])
-
-    for_row_blocks(work, len(hrls_rgb), hrls_rgb[0].size, multiple=scale)
+    factor, limit, most = map(_over_hrls, (factor, limit, most))
+    bound = np.minimum(np.maximum(limit, least + (blocks - least) * factor), most)
+    agreed = np.minimum(blocks, bound).reshape(hrls_rgb.shape)
     agreed[np.all(agreed <= least, axis=-1)] = 0
     return agreed
 
@@ -204,8 +195,10 @@ def _brightness_limit(rgb: Array, tile: TileFeatures) -> Array:
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
         limit = brightest * np.float32(FIREFLY_FACTOR)
         rare = _rare_light(rgb, tile.lrhs_area.y0 % _SQUARE, tile.lrhs_area.x0 % _SQUARE)
-        limit = np.where(rare > limit, rare * np.float32(tile.scale**2), limit)
-        return np.where(brightest > 0, limit, np.float32(np.inf))
+        # In place, in the memory layout of the render.
+        np.copyto(limit, rare * np.float32(tile.scale**2), where=rare > limit)
+        np.copyto(limit, np.float32(np.inf), where=~(brightest > 0))
+        return limit
 
 
 def _rare_light(rgb: Array, top: int, left: int) -> Array:

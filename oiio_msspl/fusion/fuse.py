@@ -148,7 +148,10 @@ def fuse(
             )
         frame.warnings += judgement.warnings
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
-    frame.warnings += _lost_aovs(frame)
+    for name in (ALBEDO, NORMAL):
+        if (broken := frame.repaired.get(f"hrls.{name}", 0) / frame.rgb.size) > 0.5:
+            lost = f"{broken:.0%} of the HRLS's {name} is NaN or infinite, so it tells little of the surfaces"
+            frame.warnings.append(Finding("broken_aov", f"{lost}; render it again"))
     frame.seconds = session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
         frame.warnings.append(Finding("no_alpha", "the LRHS has no alpha, so the noisy alpha of the HRLS is kept"))
@@ -167,17 +170,3 @@ def check_model(session: Session, scale: int, *, error: bool) -> None:
         name = session.contract.name
         hint = f"; --model {name.rpartition('-x')[0]} takes the one for the pair" if name in shipped_models() else ""
         raise InputError(f"model {name} is for x{session.contract.scale}, but this pair is x{scale}{hint}")
-
-
-def _lost_aovs(frame: FusedFrame) -> list[Finding]:
-    """Return a sentence for each AOV of the HRLS that is broken in most of its values."""
-    broken = {name: frame.repaired.get(f"hrls.{name}", 0) / frame.rgb.size for name in (ALBEDO, NORMAL)}
-    return [
-        Finding(
-            "broken_aov",
-            f"{fraction:.0%} of the HRLS's {name} is NaN or infinite, so it tells little of the surfaces; "
-            "render it again",
-        )
-        for name, fraction in broken.items()
-        if fraction > 0.5
-    ]

@@ -30,7 +30,7 @@ from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
 from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
-from oiio_msspl.fusion.tiles.features import RepairCounts, read_lrhs
+from oiio_msspl.fusion.tiles.features import read_lrhs
 from oiio_msspl.image.arrays import Array, Mask, repair, unload
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import columns_apart, even_and_odd, grown, interpolate, means_around
@@ -93,7 +93,7 @@ class RenderPair:
         high = np.concatenate(for_bands(alignment, band))
         if self.is_one_render:
             return self.halves(high)
-        lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
+        lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], exact=True)[RGB]
         return _bounded(lrhs), high
 
     def cells(self, light: Light) -> list[Array]:

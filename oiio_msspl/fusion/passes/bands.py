@@ -121,7 +121,8 @@ class Band:
         needed = [*colours.values(), RGB, *names, *([ALBEDO, NORMAL] if self.to_fit else [])]
         window, counts = alignment.hr_data_window, RepairCounts()
         features = read_features(sources.high, self._hrls_area, window, needed, counts=counts, counted=self.hrls_core)
-        self.repaired = {names[name]: count for name, count in counts.repaired.items() if name in names}
+        broken = ((name, n) for (kind, name), n in counts.items() if kind == "repaired")
+        self.repaired = {names[name]: n for name, n in broken if n and name in names}
         """How many values of each layer of the HRLS were NaN or infinite."""
         self.colours: dict[Factor, Array] = {
             factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in colours.items()

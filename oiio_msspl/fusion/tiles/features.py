@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +20,9 @@ from oiio_msspl.image.filters import box_downsample, enlarged, filled, grown, in
 
 Indices = NDArray[np.int64]
 T = TypeVar("T", bound=np.generic)
+#: Numbers of values of a render that were changed, by kind and feature: ``repaired`` ones were NaN or infinite, and
+#: ``negative`` ones, colours out of gamut, were set to 0.
+RepairCounts = Counter[tuple[str, str]]
 
 #: Features that may be negative.
 SIGNED_FEATURES = {NORMAL}
@@ -29,23 +33,6 @@ FIREFLY_FACTOR = 256.0
 #: A bucket that failed spans at least this many HRLS pixels and LRHS pixels on a side, and this fraction of the other
 #: render's pixels is lit there. If fewer are, or in smaller squares, rare light may miss all pixels by chance.
 BUCKET_HRLS, BUCKET_LRHS, BUCKET_LIT = 16, 4, 0.75
-
-
-@dataclass
-class RepairCounts:
-    """The numbers of values of a render that were changed, by feature."""
-
-    repaired: dict[str, int] = field(default_factory=dict)
-    """NaN or infinite."""
-    negative: dict[str, int] = field(default_factory=dict)
-    """Negative and set to 0: colours out of gamut."""
-
-    def add(self, feature: str, values: Array, changed: Mask) -> None:
-        """Count the changed values of a feature. ``changed`` is the mask of :func:`oiio_msspl.image.arrays.repair`."""
-        broken = int(np.count_nonzero(~np.isfinite(values)))
-        for counts, count in ((self.repaired, broken), (self.negative, int(np.count_nonzero(changed)) - broken)):
-            if count:
-                counts[feature] = counts.get(feature, 0) + count
 
 
 @dataclass
@@ -245,7 +232,9 @@ def read_features(
         if bad is not None:
             if counts is not None and counted is not None:
                 inside = counted.intersect(stored).slices(stored)
-                counts.add(name, values[inside], bad[inside])
+                lost = int(np.count_nonzero(~np.isfinite(values[inside])))
+                counts["repaired", name] += lost
+                counts["negative", name] += int(np.count_nonzero(bad[inside])) - lost
             missing = np.any(np.isnan(values) | np.isneginf(values), axis=-1)
             repaired = filled(repaired, missing)
             if broken is not None:

@@ -94,7 +94,7 @@ class FramePair:
     def counts(self, kind: str) -> dict[str, int]:
         """Return the numbers of values that were ``repaired`` or ``negative``, by render and feature (``lrhs.rgb``)."""
         renders = (("lrhs", self._lrhs_counts), ("hrls", self._hrls_counts))
-        return {f"{which}.{name}": n for which, counts in renders for name, n in getattr(counts, kind).items()}
+        return {f"{of}.{name}": n for of, counts in renders for (key, name), n in counts.items() if n and key == kind}
 
     def tiles(self, part: Window | None = None) -> list[Tile]:
         """Return the tiles of the grid, or of a part of it. A pass is black where none of them is."""

@@ -13,7 +13,7 @@ from oiio_msspl.fusion.checks.colours import different_colours
 from oiio_msspl.fusion.checks.framing import Framing, central_area, find_framing
 from oiio_msspl.fusion.checks.pair import check_renders
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.features import RepairCounts, read_tile
+from oiio_msspl.fusion.tiles.features import read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.colour import ACES2065, ACESCG, P3, REC709, conversion, luminance, srgb
 from oiio_msspl.image.filters import interpolate
@@ -120,7 +120,7 @@ def test_aovs_are_averaged_over_the_area_that_is_compared(scale, monkeypatch):
     lrhs = {"rgb": lr.layers["rgb"]}
     for tile in (Window(x, y, x + 32, y + 16) for y in range(0, LOW[0], 16) for x in range(0, LOW[1], 32)):
         features = ["rgb", "albedo", "normal"]
-        averages.add(read_tile(Tile(tile, tile), lrhs, alignment.grid, hr, alignment, features, RepairCounts()))
+        averages.add(read_tile(Tile(tile, tile), lrhs, alignment.grid, hr, alignment, features))
     expected = central_area(luminance(downsample(hr.layers["albedo"], scale)))
     assert expected.shape == averages.aovs["normal"].shape == (40, 40)
     np.testing.assert_allclose(averages.aovs["albedo"], expected, rtol=1e-5)

@@ -13,7 +13,7 @@ average of fused frames no longer has.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -190,9 +190,9 @@ class RenderBand:
         """Add the renders of a neighbour that a path leads to."""
         neighbour, alignment, area = hop.frame, self._alignment, self._area
         high = _Nearest(neighbour, path, self._names)
-        valid = high.finite() & path.valid
+        valid = high.finite & path.valid
         share = to_grid(alignment, valid.astype(np.float32), area)
-        colours = high.pixels(RGB, 0, len(valid))
+        colours = high.pixels(RGB, slice(None))
         hrls = to_grid(alignment, _bounded(colours) * valid[..., None], area)
         hrls = np.where(share[..., None] >= COVERED, hrls / np.maximum(share, 1e-6)[..., None], self._mean_colours)
         if self._low is None:
@@ -213,11 +213,11 @@ class RenderBand:
         top = self._rows.start
 
         def pixels(name: str, rows: slice) -> Array:
-            start, stop = top + rows.start, top + rows.stop
-            values = colours[start:stop] if name == RGB else high.pixels(name, start, stop)
+            inside = slice(top + rows.start, top + rows.stop)
+            values = colours[inside] if name == RGB else high.pixels(name, inside)
             if name != RGB or self._albedo is None or path.nearest is None:
                 return values
-            return values * _ratio(self._albedo[rows], high.pixels(ALBEDO, start, stop))
+            return values * _ratio(self._albedo[rows], high.pixels(ALBEDO, inside))
 
         self._high.add(pixels, weight[self._rows])
         if self._low is not None:
@@ -291,38 +291,29 @@ class RenderBand:
 
 
 class _Nearest:
-    """A neighbour's HRLS at the pixels that are nearest to the positions of a path."""
+    """A neighbour's HRLS at the pixels that are nearest to the positions of a path. Pixels that are not finite are 0.
+
+    Attributes:
+        finite: where all features are finite, (h, w), if the path is valid there.
+    """
 
     def __init__(self, neighbour: RenderPair, path: Path, features: Sequence[str]) -> None:
         window = neighbour.alignment.hr_data_window
         place = path.place_in(window)
-        self._size = path.valid.shape
-        pixels = _with_finite_passes(read(neighbour.hr, place, features))
-        self._planes = {name: _flat_planes(values) for name, values in pixels.items()}
-        #: Flat indices in the data window; these pixels begin at ``_first``.
+        self._images = _with_finite_passes(read(neighbour.hr, place, features))
+        self.finite = finite = _make_finite(self._images)
+        #: Flat indices in the data window; the images begin at ``_first``.
         self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
-        self._finite = _finite_pixels(pixels)
+        if path.nearest is not None:
+            # Copies of all indices take memory, and broken pixels are rare.
+            self.finite = path.valid if finite.all() else finite.take(path.nearest - self._first)
+            self._planes = {name: _flat_planes(values) for name, values in self._images.items()}
 
-    def finite(self) -> Mask:
-        """Return where all features are finite, (h, w)."""
-        if self._finite is None:
-            return np.ones(self._size, bool)
-        return self._finite.take(self._indices(0, self._size[0]))
-
-    def pixels(self, name: str, start: int, stop: int) -> Array:
-        """Return a feature at some rows (n, w, c). Pixels that are not finite are 0."""
-        indices = self._indices(start, stop)
-        values = _take(self._planes[name], indices)
-        if self._finite is not None:
-            values[~self._finite.take(indices)] = 0
-        return values
-
-    def _indices(self, start: int, stop: int) -> NDArray[np.intp]:
-        """Return the flat indices of the nearest pixels at some rows (n, w)."""
-        if self._nearest is not None:
-            return self._nearest[start:stop] - self._first
-        width = self._size[1]
-        return np.arange(start * width, stop * width, dtype=np.intp).reshape(-1, width)
+    def pixels(self, name: str, rows: slice) -> Array:
+        """Return a feature at some rows (n, w, c), not to be changed."""
+        if self._nearest is None:
+            return np.asarray(self._images[name][rows])
+        return _take(self._planes[name], self._nearest[rows] - self._first)
 
 
 def _ratio(own: Array, other: Array) -> Array:
@@ -352,20 +343,16 @@ def _with_finite_passes(features: Features) -> Features:
 
 def _make_finite(features: Features) -> Mask:
     """Return where all features are finite, (h, w), and set other pixels to 0."""
-    finite = _finite_pixels(features)
-    if finite is None:
-        return np.ones(next(iter(features.values())).shape[:2], bool)
-    for name, values in features.items():
-        features[name] = np.where(finite[..., None], values, np.float32(0))
-    return finite
-
-
-def _finite_pixels(features: Mapping[str, Array]) -> Mask | None:
-    """Return where all features (..., c) are finite, (...); None if they are everywhere."""
+    finite = np.ones(next(iter(features.values())).shape[:2], bool)
     # An image is summed up ten times as fast as its pixels are tested. The sum of finite pixels may overflow.
     with np.errstate(over="ignore", invalid="ignore"):
-        doubtful = [values for values in features.values() if not np.isfinite(values.sum())]
-    return np.logical_and.reduce([np.isfinite(values).all(axis=-1) for values in doubtful]) if doubtful else None
+        for values in features.values():
+            if not np.isfinite(values.sum()):
+                finite &= np.isfinite(values).all(axis=-1)
+    if not finite.all():
+        for name, values in features.items():
+            features[name] = np.where(finite[..., None], values, np.float32(0))
+    return finite
 
 
 def _bounded(rgb: Array) -> Array:

@@ -25,7 +25,6 @@ from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, l
 from oiio_msspl.fusion.passes.lines import STEPS
 from oiio_msspl.fusion.passes.network import LayerFuser, LayersByNetwork
 from oiio_msspl.fusion.passes.plan import PassJob, plan_passes
-from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.image.arrays import HALF_MAX, Array, unload
 from oiio_msspl.image.parallel import half_of_the_threads, in_parallel, one_ahead
 
@@ -68,7 +67,7 @@ def fuse_passes(
         pixels: where the fused layers go; None for a new store.
         fuse_layers: the network that fuses single layers. Layers that it can't fuse are fitted, and all without one.
         cache_bytes: memory for decoded rows that two bands need.
-        progress: called with (steps done, :func:`pass_steps`).
+        progress: called with (steps done, steps in all).
 
     Raises:
         InputError: pixels can't be decoded.
@@ -89,8 +88,8 @@ def fuse_passes(
     fused.pixels.add([channel for job in jobs for channel in job.channels], window.width, window.height)
     network = LayersByNetwork(sources, jobs, fuse_layers)
     bands = len(band_windows(inputs.alignment))
-    steps = pass_steps(inputs.alignment, inputs.sets, by_network=fuse_layers is not None)
-    done = steps - bands * sum(1 + network.count(job) for job in jobs)
+    # A layer for a network counts as much as a set. Without any set, all is done.
+    steps, done = bands * sum(1 + network.count(job) for job in jobs) or 1, 0 if jobs else 1
 
     def tell(count: int) -> None:
         nonlocal done
@@ -130,12 +129,6 @@ def fuse_passes(
         for name, count in repaired.items()
     ]
     return fused
-
-
-def pass_steps(alignment: Alignment, sets: Sequence[AdditiveSet], *, by_network: bool) -> int:
-    """Return the steps for progress: each set in each band of rows. A layer for a network counts as much as a set."""
-    layers = sum(len(additive_set.layers) for additive_set in sets) if by_network else 0
-    return len(band_windows(alignment)) * (len(sets) + layers)
 
 
 def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, LayerLight]:

@@ -17,7 +17,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.checks.averages import BLOCK, HrlsAverages, bounded_luminance
-from oiio_msspl.fusion.checks.colours import different_colours, different_primaries
+from oiio_msspl.fusion.checks.colours import different_colours
 from oiio_msspl.fusion.checks.edges import Aovs, judge_aovs
 from oiio_msspl.fusion.checks.framing import Framing, central_slices, find_framing, jackknife_error, parts
 from oiio_msspl.fusion.checks.likeness import ALIKE, VISIBLE, correlations, tone_mapped
@@ -148,8 +148,7 @@ def _judge(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> Judgem
     if not 1 / EXPOSURE_RATIO < ratio < EXPOSURE_RATIO and certain and _is_typical(ratio, hrls):
         text = f"the HRLS is {ratio:.3g} times as bright as the LRHS: are exposure and view layer the same?"
         judgement.warnings.append(Finding("exposure", text))
-    blocks = [hrls.blocks[..., i : i + 3] / BLOCK**2 for i in (0, 3)]
-    colours = different_colours(*(block.reshape(-1, 3) for block in blocks)) or different_primaries(*blocks)
+    colours = different_colours(*(hrls.blocks[..., i : i + 3].reshape(-1, 3) / BLOCK**2 for i in (0, 3)))
     if colours is not None:
         judgement.warnings.append(Finding("colours", f"{colours}: write both in the same colour space"))
     _judge_aovs(judgement, aovs(), hrls)

@@ -7,10 +7,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.errors import InputError
@@ -27,7 +25,7 @@ from oiio_msspl.fusion.tiles.features import bucket_side, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.arrays import Array, quantile
 from oiio_msspl.image.filters import box_downsample
-from oiio_msspl.image.parallel import for_row_blocks, in_background
+from oiio_msspl.image.parallel import in_background
 from oiio_msspl.model.contract import ONE_SIZE
 
 #: Renders that correlate by less have nothing in common, if :data:`VISIBLE` is expected.
@@ -325,11 +323,11 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
     the frame, which a difference of the whole frame raises.
     """
     floor = 0.05 * quantile((low + high).ravel(), 0.5)
-    means = {size: _block_means(low, high, size) for size in {size for size, _, _ in BLOCK_GROUPS}}
+    planes = low, high, np.square(low), np.square(low - high)
     for size, side, different in BLOCK_GROUPS:
         if min(low.shape) < size * side:
             continue
-        low_mean, high_mean, low_square, difference_square = means[size]
+        low_mean, high_mean, low_square, difference_square = (box_downsample(plane, size) for plane in planes)
         difference = low_mean - high_mean
         deviation = np.sqrt(np.maximum(difference_square - np.square(difference), 0))
         contrast = np.sqrt(np.maximum(low_square - np.square(low_mean), 0))
@@ -344,22 +342,3 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
             y, x = np.unravel_index(groups[row, column].argmax(), (side, side))
             return int((column + x) * size + size // 2), int((row + y) * size + size // 2)
     return None
-
-
-def _block_means(low: Array, high: Array, size: int) -> NDArray[np.float64]:
-    """Average blocks of size x size pixels: LRHS, HRLS, square of the LRHS and of the difference, 4 x (h/s, w/s).
-
-    In double precision, because a squared firefly overflows float32. Incomplete blocks at the end are left out.
-    """
-    height, width = (n // size for n in low.shape)
-    means = np.empty((4, height, width))
-
-    def work(rows: slice) -> None:
-        a, b = (v[rows, : width * size].astype(np.float64) for v in (low, high))
-        for mean, values in zip(means, (a, b, np.square(a), np.square(a - b)), strict=True):
-            row_sums = reduce(np.add, (values[y::size] for y in range(size)))
-            sums = reduce(np.add, (row_sums[:, x::size] for x in range(size)))
-            np.divide(sums, size**2, out=mean[rows.start // size : rows.stop // size])
-
-    for_row_blocks(work, height * size, 4 * width * size, multiple=size)
-    return means

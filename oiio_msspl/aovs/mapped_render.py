@@ -47,7 +47,7 @@ class MappedRender:
     additive_sets: list[AdditiveSet] = field(default_factory=list)
     """Layers that may sum to the beauty."""
     motion: MotionLayers = field(default_factory=MotionLayers)
-    """Motion vectors, position and depth."""
+    """Motion vectors and position."""
     notes: list[str] = field(default_factory=list)
     """Sentences for the user about the mapping, which begin with the feature."""
     mapped: frozenset[str] = frozenset()

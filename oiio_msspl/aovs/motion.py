@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the layers about the motion of surfaces: motion vectors, position and depth.
+"""Finds the layers about the motion of surfaces: motion vectors and position.
 
 The table of renderers names the layers, and the format in which a renderer usually writes its vectors. Manuals leave
 too much open to believe that format: :mod:`oiio_msspl.fusion.motion.source` verifies it on two frames of the shot.
@@ -109,8 +109,6 @@ class MotionLayers:
     """Layers of two or three channels of which nothing is known: the pixels may tell that they are vectors."""
     position: tuple[Channel, ...] | None = None
     """World-space position of the surface, X, Y, Z."""
-    depth: Channel | None = None
-    """Distance from the camera, along the view axis or along the ray."""
     layers: Mapping[str, Layer] = field(default_factory=dict, repr=False)
     """All layers of the view and view layer, by name without the view layer."""
 
@@ -124,7 +122,7 @@ class MotionLayers:
 def find_motion_layers(
     renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, read: Collection[Channel] = ()
 ) -> MotionLayers:
-    """Find the layers of motion vectors, position and depth in the view and view layer of a beauty.
+    """Find the layers of motion vectors and position in the view and view layer of a beauty.
 
     Args:
         renderer: entry of the table, whose names are tried before those that are common to all renderers.
@@ -140,14 +138,10 @@ def find_motion_layers(
         for vector in _vectors_in(_named(named, entry["layer"]), entry.get("channels"), MotionFormat(**words)):
             vectors.setdefault(vector.channels, vector)
     positions = (_named(named, alias) for alias in [*renderer.get("position", ()), *common["position"]])
-    depths = [d[1] for alias in [*renderer.get("depth", ()), *common["depth"]] if (d := _named(named, alias))]
-    # Of the layer without a name only Z can be a depth: R and Y are light.
-    plain = [Layer("", "", {"Z": beauty.layer.channels["Z"]})] if "Z" in beauty.layer.channels else []
     return MotionLayers(
         tuple(vectors.values()),
         tuple(_guesses(named, known_as_other(renderer), read)),
         next((triple for _, layer in filter(None, positions) if (triple := layer.triple())), None),
-        next((channel for layer in [*depths, *plain] for channel in _depth_in(layer)), None),
         named,
     )
 
@@ -237,11 +231,6 @@ def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:
     meant = [name for name in layers if view_layer_of(name, alias) == "" or same_spelling(name) == same_spelling(alias)]
     name = min(meant, key=lambda name: name != alias, default=None)
     return None if name is None else (name, layers[name])
-
-
-def _depth_in(layer: Layer) -> list[Channel]:
-    """Return the channels of a layer of depth, best one first; 3Delight's only one is called 000."""
-    return [layer.channels[c] for c in "ZRVYT" if c in layer.channels] or [*(layer.scalar() or ())]
 
 
 def _vectors_in(

@@ -48,7 +48,7 @@ def candidates_of(renderer: Mapping[str, Any], feature: str) -> list[Any]:
 
 def known_as_other(renderer: Mapping[str, Any]) -> Callable[[str], bool]:
     """Return what tells by the table whether a layer of a name is something else than a beauty."""
-    keys = (*OPTIONAL_FEATURES, "sets", "motion", "position", "depth", "data")
+    keys = (*OPTIONAL_FEATURES, "sets", "motion", "position", "data")
     entries = [entry.get(key, []) for entry in (renderer, renderers()[-1]) for key in keys]
     names = {same_spelling(name) for entry in entries for name in _names_in(entry)}
     patterns = [name for name in names if "*" in name]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which layers hold motion vectors, position and depth, by name."""
+"""Which layers hold motion vectors and position, by name."""
 
 from pathlib import Path
 
@@ -49,18 +49,17 @@ def test_vectors_of_the_chosen_view_layer_are_taken(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("channels", "position", "depth"),
+    ("channels", "position"),
     [
-        (layer("P", 1, "XYZ") | layer("", 1, "RGBZ") | layer("N_denoise", 1) | layer("denoise_albedo", 1), "P.X", "Z"),
-        (layer("", 1) | layer("position", 1, "XYZ") | layer("depth", 1, "Z"), "position.X", "depth.Z"),
-        (layer("", 1) | layer("P", 1, "XYZ"), None, None),
+        (layer("P", 1, "XYZ") | layer("", 1) | layer("N_denoise", 1) | layer("denoise_albedo", 1), "P.X"),
+        (layer("", 1) | layer("position", 1, "XYZ"), "position.X"),
+        (layer("", 1) | layer("P", 1, "XYZ"), None),
     ],
 )
-def test_position_and_depth_are_found(tmp_path, channels, position, depth):
+def test_positions_are_found(tmp_path, channels, position):
     """P is in world space for some renderers and in camera space for others: only known ones are asked."""
     found = mapped(tmp_path, channels).motion
     assert (found.position and found.position[0].name) == position
-    assert (found.depth and found.depth.name) == depth
 
 
 def test_layers_of_unknown_names_are_guesses_and_not_too_many(tmp_path):

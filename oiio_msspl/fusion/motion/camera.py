@@ -1,22 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computes the motion that the camera causes, from its matrices in the headers and from positions or depth.
+"""Computes the motion that the camera causes, from its matrices in the headers and from positions.
 
 Renderers disagree on the meaning of their matrices, and some write a matrix under the wrong name. So all are tried: the
-right one projects the positions of a frame onto the pixels that hold them. Without positions, the right one makes
-albedo and normals of two frames agree.
+right one projects the positions of a frame onto the pixels that hold them.
 """
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.fusion.motion.guides import TwoFrames
-from oiio_msspl.fusion.motion.vectors import no_vectors, sample_linear
+from oiio_msspl.fusion.motion.vectors import no_vectors
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.parallel import for_row_blocks
 
@@ -26,8 +23,6 @@ MATRICES = ("worldtoscreen", "worldtondc", "np", "worldtocamera", "nl")
 SAMPLES = 4096
 #: A matrix is right if positions land this close to their pixel, in pixels. A single sample lies anywhere in it.
 CLOSE = 0.75
-#: With depth instead of positions, a matrix must fit this many times as well as no motion.
-MARGIN = 1.5
 
 
 @dataclass(frozen=True)
@@ -41,8 +36,6 @@ class Projection:
     scale: tuple[float, float]
     shift: tuple[float, float]
     """pixel = projected * scale + shift, in x and y."""
-    depth: str = ""
-    """How depth is measured, along the ``axis`` or the ``ray``; empty if frames have positions."""
 
     def project(self, positions: Array, matrix: NDArray[np.float32]) -> Array:
         """Project positions (..., 3) to pixels of the frame, x and y (..., 2); NaN behind the camera."""
@@ -52,16 +45,13 @@ class Projection:
         return result * np.array(self.scale, np.float32) + np.array(self.shift, np.float32)
 
 
-def find_projection(frames: TwoFrames) -> Projection | None:
-    """Find out how the matrices of a shot are to be read; None if there are none, or none fits."""
-    if not _attributes(frames.first):
+def find_projection(render: MappedRender) -> Projection | None:
+    """Find out how the matrices of a shot are to be read: one of the header projects positions onto their pixels.
+
+    None if there are none, or none fits.
+    """
+    if not render.motion.position or not _attributes(render):
         return None
-    return _by_position(frames.first) if frames.first.motion.position else _by_depth(frames)
-
-
-def _by_position(render: MappedRender) -> Projection | None:
-    """Find the matrix of the header that projects positions onto their pixels."""
-    assert render.motion.position is not None
     window = render.data_window
     positions = render.file.read(render.motion.position, window)
     good = np.isfinite(positions).all(axis=-1) & (positions != 0).any(axis=-1)
@@ -85,9 +75,9 @@ def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Pr
     window = render.data_window
     vectors, known = no_vectors(render)
     here, there = (_matrix(frame, projection.attribute) for frame in (render, neighbour))
-    positions = _positions(render, projection)
-    if here is None or there is None or positions is None:
+    if here is None or there is None or not render.motion.position:
         return vectors, known
+    positions = render.file.read(render.motion.position, window)
     distances = np.empty(known.shape, np.float32)
 
     def work(rows: slice) -> None:
@@ -106,70 +96,6 @@ def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Pr
     if not known.any() or np.median(distances[known]) > CLOSE:
         return no_vectors(render)
     return vectors, known
-
-
-def _by_depth(frames: TwoFrames) -> Projection | None:
-    """Find the matrix to the screen, and the kind of depth, that make the guides of both frames agree."""
-    window = frames.first.display_window
-    best, best_left = None, 1.0
-    for attribute in _attributes(frames.first):
-        for (low, high), up, depth in itertools.product(((-1, 1), (0, 1)), (True, False), ("axis", "ray")):
-            x, y = window.width / (high - low), window.height / (high - low)
-            shift = (window.x0 - 0.5 - low * x, window.y0 - 0.5 + (high * y if up else -low * y))
-            projection = Projection(attribute, 3, (x, -y if up else y), shift, depth)
-            left = _left(frames, *camera_vectors(frames.first, frames.second, projection))
-            if left < best_left:
-                best, best_left = projection, left
-    return best if best_left * MARGIN < 1 else None
-
-
-def _left(frames: TwoFrames, vectors: Array, known: Mask) -> float:
-    """Return the share of the differences between the guides that is left, geometric mean; 1 without motion."""
-    side = frames.reduction
-    rows, columns = (slice(s.start + side // 2, s.stop, side) for s in frames.window.slices(frames.first.data_window))
-    vectors, known = vectors[rows, columns] / np.float32(side), known[rows, columns]
-    left = []
-    for guide in frames.guides:
-        here, there = guide.images
-        height, width = here.shape[:2]
-        steep = guide.steepness[0]
-        use = known[:height, :width] & (steep > 0) & (steep >= np.quantile(steep, 0.75))
-        still = np.abs(there - here).mean(axis=-1)[use]
-        if use.any() and np.median(still) > 0:
-            y, x = np.nonzero(use)
-            way = vectors[y, x]
-            moved = sample_linear(there, x + way[:, 0], y + way[:, 1])
-            left.append(float(np.median(np.abs(moved - here[use]).mean(axis=-1)) / np.median(still)))
-    return float(np.exp(np.mean(np.log(np.maximum(left, 1e-9))))) if left else 1.0
-
-
-def _positions(render: MappedRender, projection: Projection) -> Array | None:
-    """Read the world positions (h, w, 3) of the pixels, or compute them from depth; None if the frame has neither."""
-    window = render.data_window
-    if not projection.depth:
-        return render.file.read(render.motion.position, window) if render.motion.position else None
-    attribute = next((key for key in render.metadata if key.lower() in ("worldtocamera", "nl")), "")
-    screen, camera = _matrix(render, projection.attribute), _matrix(render, attribute)
-    if screen is None or camera is None or render.motion.depth is None or np.linalg.matrix_rank(camera) < 4:
-        return None
-    depth = render.file.read([render.motion.depth], window)
-    y, x = np.mgrid[window.y0 : window.y1, window.x0 : window.x1].astype(np.float32)
-    across, up = (
-        (pixels - np.float32(shift)) / np.float32(scale)
-        for pixels, scale, shift in zip((x, y), projection.scale, projection.shift, strict=True)
-    )
-    # Seen from the camera, a point appears at (across, up) if it is at right angles to both normals.
-    to_world = np.linalg.inv(camera.astype(np.float64))
-    columns = (to_world @ screen)[:3].astype(np.float32)
-    normals = [columns[:, axis] - place[..., None] * columns[:, 3] for axis, place in enumerate((across, up))]
-    ray = np.cross(normals[0], normals[1])
-    ray *= np.sign(ray @ columns[:, 3:])  # forward
-    length = np.abs(ray[..., 2:]) if projection.depth == "axis" else np.linalg.norm(ray, axis=-1, keepdims=True)
-    with np.errstate(all="ignore"):
-        ray *= np.abs(depth) / length
-    points: Array = ray @ to_world[:3, :3].astype(np.float32) + to_world[3, :3].astype(np.float32)
-    points[~(np.isfinite(depth[..., 0]) & (depth[..., 0] != 0))] = 0
-    return points
 
 
 def _matrix(render: MappedRender, attribute: str) -> NDArray[np.float32] | None:

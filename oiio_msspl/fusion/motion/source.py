@@ -6,7 +6,7 @@ frame to its neighbour. The best source comes first:
 
 1. motion vectors whose format two frames have verified;
 2. none needed: the camera stands still;
-3. the camera's matrices with world-space positions or depth: exact for what does not move itself;
+3. the camera's matrices with world-space positions: exact for what does not move itself;
 4. optical flow, computed on the fused pictures.
 """
 
@@ -339,9 +339,8 @@ def _without_vectors(frames: TwoFrames, checks: Sequence[FieldCheck]) -> MotionS
     seen = f"{_problems(checks)}; " if checks else f"no motion vectors{unknown}; "
     if checks and all(check.zero for check in checks) and moved.any():
         seen = f"{_problems(checks)}, though the picture moves (Cycles writes zeros if motion blur is on); "
-    if projection := find_projection(frames):
-        places = "depth" if projection.depth else "positions"
-        seen += f"the camera's matrix {projection.attribute} and {places} say where everything goes that stands still"
+    if projection := find_projection(frames.first):
+        seen += f"the camera's matrix {projection.attribute} and positions say where everything goes that stands still"
         return MotionSource(CAMERA, seen, projection=projection)
     if any(not check.zero for check in checks):
         seen += "describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels"

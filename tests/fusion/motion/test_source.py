@@ -20,7 +20,6 @@ from oiio_msspl.fusion.motion.source import MotionFrame, MotionSource, find_moti
 from tests import moving_plane as plane
 from tests.conftest import rgb, write_exr
 from tests.moving_plane import (
-    FOCAL,
     HEIGHT,
     WIDTH,
     camera_matrix,
@@ -378,25 +377,6 @@ def test_matrices_and_positions_give_the_camera_s_movement(tmp_path, names):
         frames.append(frame(tmp_path, t, {}, **{name: made[name] for name in names}))
     source = find_motion(frames[0], frames[1], required=True)
     assert source.kind == "camera", source.text
-    assert [right_share(source, frames, 1, step) for step in (-1, 1)] == [1, 1]
-
-
-@pytest.mark.parametrize("kind", ["axis", "ray"])
-def test_depth_stands_in_for_positions(tmp_path, kind):
-    """Along the axis or along the ray: the pixels tell."""
-    frames = []
-    for t in (0, 1, 2):
-        y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
-        slant = np.sqrt(1 + ((x - WIDTH / 2) ** 2 + (y - HEIGHT / 2) ** 2) / FOCAL**2)
-        depth = truck_and_dolly(t)[2] * (slant if kind == "ray" else np.ones_like(slant))
-        matrices = {
-            "worldToScreen": screen_matrix(truck_and_dolly, t),
-            "worldToCamera": camera_matrix(truck_and_dolly, t),
-        }
-        frames.append(frame(tmp_path, t, {"Z": depth.astype(np.float32)}, guides=("albedo",), **matrices))
-    source = find_motion(frames[0], frames[1], required=True)
-    assert source.kind == "camera" and "and depth say" in source.text
-    assert source.projection.depth == kind
     assert [right_share(source, frames, 1, step) for step in (-1, 1)] == [1, 1]
 
 

@@ -300,6 +300,7 @@ def test_grey_pictures_have_no_colour_space(scale):
 def test_an_aov_of_another_frame_is_noticed(scale, aov):
     other = dict(zip(("rgb", "albedo", "normal"), scene(scale, seed=50), strict=True))[aov]
     assert [w for w in warnings(scale, **{aov: other}) if f"the {aov}'s edges are not in the picture" in w]
+    assert warnings(scale, **{aov: np.full_like(other, 0.5)}) == []  # without edges
 
 
 def test_an_aov_is_not_judged_by_a_picture_without_edges(scale):

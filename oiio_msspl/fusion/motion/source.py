@@ -2,12 +2,7 @@
 """Finds out how the motion in a shot is known, and reads it.
 
 :func:`find_motion` decides once for a shot, on two frames. :meth:`MotionSource.read` then reads the motion from any
-frame to its neighbour. The best source comes first:
-
-1. motion vectors whose format two frames have verified;
-2. none needed: the camera stands still;
-3. the camera's matrices with world-space positions: exact for what does not move itself;
-4. optical flow, computed on the fused pictures.
+frame to its neighbour. ``docs/guide/shots.md`` lists the sources, the best one first.
 """
 
 from __future__ import annotations

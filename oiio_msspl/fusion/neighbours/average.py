@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Averages a frame with its neighbours: both of its renders before they are fused, and the fused frame after that.
 
-One engine does both averages, in bands of rows. It follows the surfaces of a band from neighbour to neighbour, judges
-how much each pixel counts there, and sums up the weighted pixels. A neighbour counts where it shows the same surface,
-so that its vectors lead back (:class:`Path`), and the more, the less the light has changed (:class:`Light`). What
-differs between renders and fused frames is a strategy each: :class:`RenderBand` and :class:`ResultBand`. A value that
-no neighbour may change keeps its bits.
+One engine does both, in bands of rows, see ``docs/design/temporal.md``. What differs is a strategy each:
+:class:`RenderBand` and :class:`ResultBand`. A value that no neighbour may change keeps its bits.
 """
 
 from __future__ import annotations

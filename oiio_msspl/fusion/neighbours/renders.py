@@ -1,14 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the average of renders fetches of a neighbour, and how much a pixel of it counts.
 
-To average renders is as if the frame had more samples. The network then sees less noise, so it keeps detail that an
-average of fused frames no longer has.
-
-- The HRLS's pixels are fetched from the nearest pixel of the neighbour. Interpolation would spread their noise, which
-  networks take for texture. In clean renders the wrong place would show, so their light is multiplied by the ratio of
-  the albedo here and there, and their albedo and normals are those of the frame.
-- The LRHS has less noise, and its pixels are large. Its light and alpha are interpolated. Other layers, such as the
-  albedo, have hardly any noise to remove. They are fetched from the nearest pixel, which takes less time.
+``docs/design/temporal.md`` says why the HRLS comes from the nearest pixels, and the light of the LRHS is interpolated.
 """
 
 from __future__ import annotations

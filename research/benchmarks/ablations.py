@@ -110,7 +110,7 @@ def pool(views: list[View]) -> list[list[Tensor]]:
     return batches
 
 
-def train(variant: Variant, batches: list[list[Tensor]], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
+def train(variant: Variant, batches: list[list[Tensor]], steps: int) -> MultiResolutionFusion:
     """Return a network after ``steps`` training steps."""
     torch.manual_seed(0)
     network = MultiResolutionFusion(SCALE, **REDUCED, lrhs_channels=HRLS_CHANNELS)
@@ -120,7 +120,7 @@ def train(variant: Variant, batches: list[list[Tensor]], steps: int, *, bfloat16
     schedule = LambdaLR(optimizer, lambda step: min(1.0, 2 * (1 - step / steps)))  # constant, then linear to zero
     for step in range(steps):
         lrhs, hrls, target = (torch.rot90(image, step // POOL % 4, (2, 3)) for image in batches[step % POOL])
-        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+        with torch.autocast("cpu", torch.bfloat16):
             output = network(lrhs * low_mask, hrls * high_mask)
         optimizer.zero_grad(set_to_none=True)
         variant.loss(output.float(), target).backward()
@@ -148,7 +148,6 @@ def main() -> None:
     parser = results.parser(__doc__)
     parser.add_argument("views", type=Path, help="folder of views")
     parser.add_argument("--steps", type=int, default=1500, help="per row (default: %(default)s)")
-    parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16", help="(default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
@@ -159,7 +158,7 @@ def main() -> None:
     batches = pool(views)
     for variant in VARIANTS:
         if variant.name not in done:
-            network = train(variant, batches, args.steps, bfloat16=args.precision == "bf16")
+            network = train(variant, batches, args.steps)
             row = {"name": variant.name, **evaluate(network, variant, held_out), **effort}
             results.show([row], args.table, ("name",))
 

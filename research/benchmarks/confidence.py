@@ -46,7 +46,7 @@ def measure(model: str, pairs: list[tuple[Array, Array]]) -> Row:
     """Return the row of a model, from predicted and actual errors."""
     predicted, actual = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in range(2))
     worst = np.argsort(predicted)[-len(predicted) // 10 :]
-    squares = [np.concatenate([box_downsample(_cropped(pair[i]), SQUARE).ravel() for pair in pairs]) for i in range(2)]
+    squares = [np.concatenate([box_downsample(pair[i], SQUARE).ravel() for pair in pairs]) for i in range(2)]
     return {
         "method": model,
         "model": model,
@@ -55,11 +55,6 @@ def measure(model: str, pairs: list[tuple[Array, Array]]) -> Row:
         "worst_tenth": float(actual[worst].sum() / actual.sum()),
         "correlation": float(np.corrcoef(*np.log(np.maximum(squares, 1e-4)))[0, 1]),
     }
-
-
-def _cropped(image: Array) -> Array:
-    height, width = (n // SQUARE * SQUARE for n in image.shape[:2])
-    return image[:height, :width]
 
 
 def main() -> None:

@@ -284,8 +284,7 @@ def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int], scale: int) -> 
     mean = np.einsum("p,phwc->hwc", weights.astype(np.float32), as_float32(stored[passes]))
     if scale in view.lr:
         return mean
-    height, width = (n // scale * scale for n in mean.shape[:2])
-    return box_downsample(mean[:height, :width], scale)
+    return box_downsample(mean, scale)
 
 
 def read_hrls(view: View, passes: NDArray[np.int64] | list[int], rows: slice, columns: slice) -> Array:

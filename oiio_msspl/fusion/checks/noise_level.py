@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.checks.spread_noise import (
     CACHE_BYTES,
@@ -69,15 +69,11 @@ def has_little_noise(
 
 def _noise_in_blocks(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> NDArray[np.float64]:
     """Return the deviation (n) of the pixels of blocks from a smooth course. Fine texture counts, too."""
-    deviations, window, scale = [], alignment.hr_data_window, alignment.scale
-    with hr.cache_strips(CACHE_BYTES), lr.cache_strips(CACHE_BYTES):
-        for grid in sample_windows(alignment.grid):
-            area = in_hrls_pixels(grid, scale)
-            mean = read_features(hr, area, window, [RGB])[RGB]
-            if scale == ONE_SIZE and lr is not hr:
-                mean = (mean + read_features(lr, area, window, [RGB])[RGB]) / np.float32(2)
-            image = encode_radiance(luminance(mean)[..., None], find_exposure(mean))[..., 0]
-            deviations.append(noise_in(blocks_of(image)).std(axis=(1, 2)))
+    deviations = []
+    for low, high, _ in samples_of(lr, hr, alignment):
+        mean = (high + low) / np.float32(2) if alignment.scale == ONE_SIZE and lr is not hr else high
+        image = encode_radiance(luminance(mean)[..., None], find_exposure(mean))[..., 0]
+        deviations.append(noise_in(blocks_of(image)).std(axis=(1, 2)))
     return np.concatenate(deviations)
 
 

@@ -145,9 +145,8 @@ def invert(own: Array, other: Array, other_known: Mask, window: Window, other_wi
         back = sample_linear(other, at_x, at_y) + way
         vectors[rows] = way
         inside = (at_x >= -0.5) & (at_y >= -0.5) & (at_x <= other.shape[1] - 0.5) & (at_y <= other.shape[0] - 0.5)
-        known[rows] = (
-            inside & (np.hypot(back[..., 0], back[..., 1]) < INVERSION_ERROR) & nearest_values(other_known, at_x, at_y)
-        )
+        returns = np.hypot(back[..., 0], back[..., 1]) < INVERSION_ERROR
+        known[rows] = inside & returns & other_known.take(nearest_indices(at_x, at_y, other_known.shape))
 
     for_row_blocks(work, height, width * 8)
     vectors[~known] = 0
@@ -197,9 +196,3 @@ def sample_linear(image: Array, x: Array, y: Array) -> Array:
     below += (pixels.take(corner + right, 0) - below) * u
     result += (below - result) * v
     return result
-
-
-def nearest_values(image: NDArray[np.bool_], x: Array, y: Array) -> Mask:
-    """Return the pixels of a mask that are nearest to positions (h, w)."""
-    height, width = image.shape
-    return image.take(nearest_indices(x, y, (height, width)))

@@ -8,6 +8,7 @@ frame. So at the borders of either frame a neighbour counts less, the more its b
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import Window
@@ -66,7 +67,7 @@ class ResultBand:
             weight *= self._light.moved_weight
         if self._company is not None:
             weight *= self._company
-        mixed = self._borders | _borders_at(hop, path, area)
+        mixed = self._borders | _borders(hop.back, hop.frame.alignment.hr_data_window, area, path.nearest)
         here, there = (luminance(images[RGB][mixed]) for images in (self._own, warped))
         weight[mixed] *= likeness(here, there, self._light.darkest, DIFFERENT_MIX)
         # A neighbour may have no alpha.
@@ -83,18 +84,11 @@ def _company(frames: Array) -> Array:
     return np.clip((frames - 1) / np.float32(COMPANY - 1), 0, 1)
 
 
-def _borders_at(hop: Hop[FusedFrame], path: Path, area: Window) -> Mask:
-    """Find the pixels (h, w) of an area that lead to pixels of a neighbour that may show two surfaces."""
-    if path.nearest is None or hop.back.borders is None:
-        return _borders(hop.back, hop.frame.alignment.hr_data_window, area)
-    return hop.back.borders.reshape(-1).take(path.nearest, mode="clip")
-
-
-def _borders(motion: Motion, window: Window, area: Window) -> Mask:
-    """Return the borders of surfaces (h, w) in an area of a frame."""
+def _borders(motion: Motion, window: Window, area: Window, nearest: NDArray[np.intp] | None = None) -> Mask:
+    """Return the borders of surfaces (h, w) in an area of a frame, or at flat indices (h, w) of its pixels."""
     if motion.borders is None:
         return np.zeros((area.height, area.width), np.bool_)
-    return motion.borders[area.slices(window)]
+    return motion.borders[area.slices(window)] if nearest is None else motion.borders.take(nearest, mode="clip")
 
 
 def _warp(frame: FusedFrame, path: Path) -> Images:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,9 +79,10 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
     if outside:
         return SumCheck(1.0, problem=f"{outside[0]} has another data window")
     sums, of_layers = np.zeros(4), np.zeros((len(layers), 5))
-    for strip in _strips_of(light, layers, total):
-        sums += strip.sums()
-        of_layers += strip.layer_sums()
+    for pixels, sought, rest, usable in _strips_of(light, layers, total):
+        lacking = rest[usable]
+        sums += [np.abs(x).sum() for x in (sought[usable], lacking, np.maximum(lacking, 0), np.minimum(lacking, 0))]
+        of_layers += [_layer_sums(layer, usable) for layer in pixels]
     light.pixels.unload()
     whole, wrong, missing, surplus = sums.tolist()
     negative, positive, equal, lit, finite = of_layers.T
@@ -119,31 +119,15 @@ def is_sum_of(light: LayerLight, layer: AdditiveLayer, parts: Sequence[AdditiveL
     return not check.problem and not check.remainder
 
 
-class _Strip(NamedTuple):
-    """Some rows of a set, (h, w, 3): its layers, what they should sum to, what they lack of it, and usable values."""
+#: Some rows of a set, (h, w, 3): its layers, what they should sum to, what they lack of it, and usable values.
+_Strip = tuple[list[Array], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
 
-    layers: list[Array]
-    total: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    usable: NDArray[np.bool_]
 
-    def sums(self) -> NDArray[np.float64]:
-        """Return the sums of light, of what is wrong, of what is missing and of what is too much."""
-        rest = self.rest[self.usable]
-        parts = self.total[self.usable], rest, np.maximum(rest, 0), np.maximum(-rest, 0)
-        return np.array([np.abs(part).sum() for part in parts])
-
-    def layer_sums(self) -> NDArray[np.float64]:
-        """Return for each layer: its negative and its positive light, equal pixels, lit ones, and if one is finite."""
-        return np.array([
-            [
-                -np.minimum(pixels, 0)[self.usable].sum(dtype=np.float64),
-                np.maximum(pixels, 0)[self.usable].sum(dtype=np.float64),
-                *_equal_pixels(pixels),
-                np.isfinite(pixels).any(),
-            ]
-            for pixels in self.layers
-        ])  # fmt: skip
+def _layer_sums(pixels: Array, usable: NDArray[np.bool_]) -> list[float]:
+    """Return a layer's negative and its positive light, equal pixels, lit ones, and if a value is finite."""
+    values = pixels[usable]
+    light = [-np.minimum(values, 0).sum(dtype=np.float64), np.maximum(values, 0).sum(dtype=np.float64)]
+    return [*light, *_equal_pixels(pixels), float(np.isfinite(pixels).any())]
 
 
 def _superfluous(light: LayerLight, layers: Sequence[AdditiveLayer]) -> list[str]:
@@ -151,10 +135,9 @@ def _superfluous(light: LayerLight, layers: Sequence[AdditiveLayer]) -> list[str
     choices = [[i] for i in range(len(layers))]
     choices.append([i for i, layer in enumerate(layers) if any(layer.words < finer.words for finer in layers)])
     total, wrong = 0.0, np.zeros(len(choices))
-    for strip in _strips_of(light, layers):
-        rest, usable = strip.rest[strip.usable], strip.usable
-        total += np.abs(strip.total[usable]).sum()
-        wrong += [np.abs(rest + sum(strip.layers[i][usable] for i in choice)).sum() for choice in choices]
+    for pixels, sought, rest, usable in _strips_of(light, layers):
+        total += np.abs(sought[usable]).sum()
+        wrong += [np.abs(rest[usable] + sum(pixels[i][usable] for i in choice)).sum() for choice in choices]
     best = int(wrong.argmin())
     return [layers[i].name for i in choices[best]] if wrong[best] <= TOLERANCE * total else []
 
@@ -183,7 +166,7 @@ def _strips_of(
         sought, pixels = features[whole].astype(np.float64), [features[name] for name in names]
         with np.errstate(invalid="ignore", over="ignore"):
             rest = sought - sum(pixels)
-        yield _Strip(pixels, sought, rest, np.isfinite(rest) & (sought < brightest))
+        yield pixels, sought, rest, np.isfinite(rest) & (sought < brightest)
 
 
 def _equal_pixels(pixels: Array) -> tuple[int, int]:

@@ -43,6 +43,7 @@ from research.benchmarks import oidn, results
 from research.benchmarks.accuracy import mean_flip
 from research.benchmarks.render.film import write_exr
 from research.benchmarks.render.own_scenes import GROUPS, SCENES, lamps
+from research.benchmarks.render.sequences import Camera
 from research.benchmarks.shots.measures import flicker, motion_error
 from research.datagen.mitsuba import start as start_mitsuba
 
@@ -141,10 +142,7 @@ class Renderer:
         return np.asarray(there - here, np.float32)
 
     def _project(self, positions: Image, at: float) -> NDArray[Any]:
-        inverse = np.linalg.inv(_camera(at))
-        seen = positions @ inverse[:3, :3].T + inverse[:3, 3]
-        focal = self.size[0] / 2 / np.tan(np.radians(ANGLE) / 2)
-        return -focal * seen[..., :2] / np.maximum(seen[..., 2:], 1e-3)
+        return Camera(_camera(at), self.size[0] / 2 / np.tan(np.radians(ANGLE) / 2), (0, 0)).project(positions)
 
 
 def _camera(at: float) -> NDArray[Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -133,19 +134,8 @@ def fuse(
             judgement = check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
         if frame.trust is not None and not judgement.independent:
             # The noise of one render can't be told from detail by that of the other one.
-            return fuse(
-                lr,
-                hr,
-                session,
-                error=error,
-                trust=False,
-                clean_aovs=clean_aovs,
-                half=half,
-                share=share,
-                max_memory=max_memory,
-                held=held,
-                progress=progress,
-            )
+            again = partial(fuse, lr, hr, session, error=error, trust=False, clean_aovs=clean_aovs, half=half)
+            return again(share=share, max_memory=max_memory, held=held, progress=progress)
         frame.warnings += judgement.warnings
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
     for name in (ALBEDO, NORMAL):

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuses places of a frame again, from its own renders: those where no neighbour counts.
 
-A network tells noise from detail by what is around. Where averages of many frames surround pixels of one frame, it
-leaves their noise in. So such pixels become those that the frame has without neighbours.
+``docs/design/temporal.md`` says why such pixels become those that the frame has without neighbours.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the average of fused frames fetches of a neighbour, and how much a pixel of it counts.
 
-The pixels are interpolated. A pixel at the border of two surfaces shows a mixture of them, which changes from frame to
-frame. So at the borders of either frame a neighbour counts less, the more its brightness differs.
+``docs/design/temporal.md`` says why neighbours count less at the borders of surfaces.
 """
 
 from __future__ import annotations

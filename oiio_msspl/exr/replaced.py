@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.image.arrays import FLOAT_MAX, HALF_MAX, Array, reserve
+from oiio_msspl.image.arrays import FLOAT_MAX, HALF_MAX, Array, blank, unload
 
 #: NumPy's type of each pixel type.
 DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.uint32}
@@ -20,15 +19,12 @@ DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.ui
 class ReplacedChannels:
     """New pixels for some channels, in their stored types.
 
-    They are kept in a temporary file, because forty channels of an 8K frame take gigabytes. The system deletes the file
-    with the process, even a killed one. The variable ``TMPDIR`` says where it lies.
+    They are kept in temporary files, because forty channels of an 8K frame take gigabytes. The system deletes the files
+    with the process, even a killed one. The variable ``TMPDIR`` says where they lie.
     """
 
     def __init__(self) -> None:
-        self._places: dict[Channel, tuple[int, int]] = {}
-        """Offset in the file and width of every channel."""
-        self._size = 0
-        self._file = tempfile.TemporaryFile(prefix="msspl-")  # noqa: SIM115 - it lives as long as this object
+        self._planes: dict[Channel, NDArray[Any]] = {}
 
     def add(self, channels: Sequence[Channel], width: int, height: int) -> None:
         """Make room for channels of ``width`` x ``height`` pixels; a channel that has room keeps it.
@@ -36,14 +32,14 @@ class ReplacedChannels:
         Raises:
             MssplError: the disk has no room.
         """
-        for channel in channels:
-            if channel not in self._places:
-                self._places[channel] = self._size, width
-                self._size += width * height * np.dtype(DTYPES[channel.type]).itemsize
-        reserve(self._file, self._size)
+        for kind, dtype in DTYPES.items():  # one file for all channels of a type
+            new = [channel for channel in dict.fromkeys(channels) if channel not in self and channel.type == kind]
+            if new:
+                planes = np.moveaxis(blank((height, width, len(new)), dtype, on_disk=True), -1, 0)
+                self._planes |= zip(new, planes, strict=True)
 
     def __contains__(self, channel: Channel) -> bool:
-        return channel in self._places
+        return channel in self._planes
 
     def put(self, channel: Channel, start: int, rows: Array) -> int:
         """Store rows (n, width) of a channel from row ``start`` on; values too bright for its type are clipped.
@@ -52,17 +48,14 @@ class ReplacedChannels:
             The number of values that were too bright.
         """
         largest = HALF_MAX if channel.type == "half" else FLOAT_MAX
-        stored = np.clip(rows, -largest, largest).astype(DTYPES[channel.type])
-        self._seek(channel, start)
-        self._file.write(stored.tobytes())
+        plane = self._planes[channel]
+        plane[start : start + len(rows)] = np.clip(rows, -largest, largest)
+        unload(plane)
         return int(np.count_nonzero(rows > largest)) if rows.size and rows.max() > largest else 0
 
     def get(self, channel: Channel, start: int, stop: int) -> NDArray[Any]:
         """Return rows of a channel, (stop - start, width)."""
-        dtype = np.dtype(DTYPES[channel.type])
-        width = self._seek(channel, start)
-        data = self._file.read((stop - start) * width * dtype.itemsize)
-        return np.frombuffer(data, dtype).reshape(stop - start, width)
+        return self._planes[channel][start:stop]
 
     def apply(self, channels: Sequence[Channel], start: int, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return a copy of rows (n, width, channels) from row ``start`` on, with the new pixels in it."""
@@ -72,10 +65,5 @@ class ReplacedChannels:
         for i, channel in enumerate(channels):
             if channel in self:
                 pixels[..., i] = self.get(channel, start, start + len(pixels))
+                unload(self._planes[channel])
         return pixels
-
-    def _seek(self, channel: Channel, row: int) -> int:
-        """Go to a row of a channel, and return the channel's width."""
-        offset, width = self._places[channel]
-        self._file.seek(offset + row * width * np.dtype(DTYPES[channel.type]).itemsize)
-        return width

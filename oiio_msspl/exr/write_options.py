@@ -20,15 +20,11 @@ COMPRESSIONS = (*LOSSLESS, "pxr24", "b44", "b44a", "dwaa", "dwab", "lj2k")
 #: Replaces a lossy compression of the source.
 DEFAULT_COMPRESSION = "zip"
 
-#: Names of the layers that hold the predicted error, how many frames were averaged, and how far the HRLS is believed.
-ERROR_LAYER, FRAMES_LAYER, TRUST_LAYER = "error", "frames", "trust"
-#: Names of the layers that hold albedo and normal without noise.
-ALBEDO_LAYER, NORMAL_LAYER = "denoised_albedo", "denoised_normal"
+#: The names of layers that are added, each with the field of :class:`WriteOptions` that asks for it.
+ADDED = {"error": "error_layer", "frames": "frames_layer", "trust": "trust_layer"}
+ADDED |= {"denoised_albedo": "data_passes", "denoised_normal": "data_passes"}
 #: The channels of these layers.
-COMPONENTS = {ERROR_LAYER: "Y", FRAMES_LAYER: "Y", TRUST_LAYER: "Y", ALBEDO_LAYER: "RGB", NORMAL_LAYER: "XYZ"}
-#: The options that add them.
-OPTIONS = {ERROR_LAYER: "--error-layer", FRAMES_LAYER: "--frames-layer", TRUST_LAYER: "--trust-layer"}
-OPTIONS |= dict.fromkeys((ALBEDO_LAYER, NORMAL_LAYER), "--data-passes")
+COMPONENTS = {"error": "Y", "frames": "Y", "trust": "Y", "denoised_albedo": "RGB", "denoised_normal": "XYZ"}
 
 
 @dataclass(frozen=True)

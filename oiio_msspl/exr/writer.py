@@ -34,7 +34,7 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import channel_names, write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
-from oiio_msspl.exr.write_options import OPTIONS, WriteOptions
+from oiio_msspl.exr.write_options import ADDED, WriteOptions
 from oiio_msspl.findings import Finding
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.parallel import one_ahead
@@ -112,8 +112,8 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
     kept = {layer.name for channel, layer in contents.layers.items() if channel not in contents.dropped}
     if name := next((name for name in contents.extra if name in kept), None):
         raise InputError(
-            f"{OPTIONS[name]}: {source.path} has a layer '{name}' of its own; choose other layers with --layers, "
-            "or leave the option out"
+            f"--{ADDED[name].replace('_', '-')}: {source.path} has a layer '{name}' of its own; choose other layers "
+            "with --layers, or leave the option out"
         )
     if options.layout == "multilayer":
         channel_names(contents)

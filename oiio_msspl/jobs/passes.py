@@ -10,14 +10,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels
-from oiio_msspl.exr.write_options import (
-    ALBEDO_LAYER,
-    ERROR_LAYER,
-    FRAMES_LAYER,
-    NORMAL_LAYER,
-    TRUST_LAYER,
-    WriteOptions,
-)
+from oiio_msspl.exr.write_options import ADDED, WriteOptions
 from oiio_msspl.exr.writer import check_layout
 from oiio_msspl.model.catalogue import measured
 from oiio_msspl.model.session import Session
@@ -40,14 +33,9 @@ def check_layers(views: Sequence[MappedRender], write: WriteOptions) -> None:
             of this name, a sum of the user's is not to be fused, or the first view lacks the data passes.
     """
     hr = views[0]
-    added = {
-        ERROR_LAYER: write.error_layer,
-        FRAMES_LAYER: write.frames_layer,
-        TRUST_LAYER: write.trust_layer,
-        ALBEDO_LAYER: write.data_passes and ALBEDO in hr.features,
-        NORMAL_LAYER: write.data_passes and NORMAL in hr.features,
-    }
-    check_layout(hr.file, hr.beauty_channels, write, [name for name, is_added in added.items() if is_added])
+    added = [name for name, option in ADDED.items() if getattr(write, option)]
+    lacking = {f"denoised_{name}" for name in (ALBEDO, NORMAL) if name not in hr.features}
+    check_layout(hr.file, hr.beauty_channels, write, [name for name in added if name not in lacking])
     if write.data_passes and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
         raise InputError(f"--data-passes: {hr.name} has neither an albedo nor a normal; name them with --map")
     if write.passes == ("none",) and any(layers.by_user for layers in hr.additive_sets):

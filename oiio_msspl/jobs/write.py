@@ -16,20 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.preview import old_preview, write_preview
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.exr.write_options import (
-    ALBEDO_LAYER,
-    ERROR_LAYER,
-    FRAMES_LAYER,
-    NORMAL_LAYER,
-    TRUST_LAYER,
-    WriteOptions,
-)
+from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import write_fused
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
@@ -144,12 +136,11 @@ def store_view(hr: MappedRender, fused: FusedFrame, replaced: ReplacedChannels) 
 
 def _layers_about(fused: FusedFrame, options: WriteOptions) -> dict[str, NDArray[Any]]:
     """Return the layers about the fused beauty that are asked for."""
-    layers: dict[str, NDArray[Any]] = {} if fused.error is None else {ERROR_LAYER: fused.error}
+    layers: dict[str, NDArray[Any]] = {} if fused.error is None else {"error": fused.error}
     if options.frames_layer:
-        layers[FRAMES_LAYER] = np.ones_like(fused.rgb[..., :1]) if fused.frames is None else fused.frames
+        layers["frames"] = np.ones_like(fused.rgb[..., :1]) if fused.frames is None else fused.frames
     if options.trust_layer:
-        layers[TRUST_LAYER] = fused.trust_pixels()
+        layers["trust"] = fused.trust_pixels()
     if options.data_passes:
-        names = {ALBEDO: ALBEDO_LAYER, NORMAL: NORMAL_LAYER}
-        layers |= {names[feature]: pixels for feature, pixels in fused.clean_aovs.items()}
+        layers |= {f"denoised_{feature}": pixels for feature, pixels in fused.clean_aovs.items()}
     return layers

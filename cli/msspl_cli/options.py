@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -184,35 +185,16 @@ def choose_model(model: str, quality: str | None) -> str:
 
 
 def make_write_options(
-    layout: str,
-    compression: str | None,
-    half: bool | None,
-    layers: list[str],
-    error_layer: bool,
-    passes: list[str] | None = None,
-    frames_layer: bool = False,
-    data_passes: bool = False,
-    trust: str = "on",
-    trust_layer: bool = False,
+    passes: list[str], trust: str, *, layers: Sequence[str] = (), half: bool | None = None, **others: Any
 ) -> WriteOptions:
-    """Return the options that describe the result."""
+    """Return the options that describe the result; ``others`` are fields of :class:`WriteOptions`."""
     from oiio_msspl.exr.write_options import WriteOptions
 
     pixel_type = None if half is None else "half" if half else "float"
-    if passes and "auto" in passes and len(passes) > 1:
+    if "auto" in passes and len(passes) > 1:
         raise InputError(f"--passes {', '.join(passes)}: auto fuses all sets; leave it out, or the others")
-    patterns = () if passes == ["auto"] else tuple(passes or ())
+    patterns = () if passes == ["auto"] else tuple(passes)
     if trust not in ("on", "off"):
         raise InputError(f"--trust {trust!r}: use on or off")
-    return WriteOptions(
-        layout,
-        compression,
-        pixel_type,
-        tuple(layers),
-        patterns,
-        error_layer,
-        frames_layer,
-        trust=trust == "on",
-        trust_layer=trust_layer,
-        data_passes=data_passes,
-    )
+    kept = tuple(layers)
+    return WriteOptions(pixel_type=pixel_type, layers=kept, passes=patterns, trust=trust == "on", **others)

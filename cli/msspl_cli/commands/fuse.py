@@ -155,11 +155,11 @@ def fuse(
     lr, hr = options.low_and_high(renders)
     for path in renders:
         check_exists(path)
+    written: dict[str, Any] = {"layout": layout, "compression": compression, "error_layer": error_layer}
+    written |= {"frames_layer": frames_layer, "trust_layer": trust_layer, "data_passes": data_passes}
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
-        "write": options.make_write_options(
-            layout, compression, half, layers, error_layer, passes, frames_layer, data_passes, trust, trust_layer
-        ),
+        "write": options.make_write_options(passes, trust, layers=layers, half=half, **written),
         "model": options.choose_model(model, quality),
         "device": device,
         "threads": threads,

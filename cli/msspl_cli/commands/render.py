@@ -132,10 +132,9 @@ def render(
     extras = [beside(path, name) for path in targets for name in names]
     _check_files(scene, output, targets, extras, overwrite=overwrite, skip_existing=skip_existing)
     use_threads(threads)
+    added: dict[str, Any] = {"error_layer": error_layer, "trust_layer": trust_layer, "data_passes": data_passes}
     settings = Settings(
-        write=options.make_write_options(
-            layout, None, None, [], error_layer, passes, False, data_passes, trust, trust_layer
-        ),
+        write=options.make_write_options(passes, trust, layout=layout, **added),
         model=options.choose_model(model, quality),
         device=device,
         threads=threads,

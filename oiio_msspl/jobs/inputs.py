@@ -57,10 +57,6 @@ class InputOptions:
             if spp is not None and not 0 < spp < math.inf:
                 raise InputError(f"{option} {spp:g}: give the samples per pixel, a number above 0")
 
-    def absolute(self) -> InputOptions:
-        """Make ``map_file`` absolute, for workers with other working directories. Paths in ``mapping`` are full."""
-        return replace(self, map_file=None if self.map_file is None else self.map_file.absolute())
-
     def files(self, hr_path: Path, model: str | None) -> set[Path]:
         """Return the files that a frame is made from beside the pair: those of the mapping, and a user's model."""
         named = [self.map_file, None if model is None else Path(model)]

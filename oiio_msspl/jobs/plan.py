@@ -106,10 +106,6 @@ class ShotPlan:
         reach = {view: plan.reach for view, plan in self.views.items()}
         return Timeline(self.frames, [files.number for files in wanted], reach)
 
-    def absolute(self) -> ShotPlan:
-        """Return the plan with absolute paths, for workers with other working directories."""
-        return replace(self, frames={n: files.absolute() for n, files in self.frames.items()})
-
     def missing(self, number: int) -> list[int]:
         """Return the numbers next to a frame that lie within the shot and lack a render."""
         if not self.count or not self.frames:

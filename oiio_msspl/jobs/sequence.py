@@ -99,11 +99,6 @@ class FrameFiles:
         """The files to write."""
         return [path for path in (self.output, self.preview) if path is not None]
 
-    def absolute(self) -> FrameFiles:
-        """Return the files with absolute paths, for workers with other working directories."""
-        lr, hr, preview = (None if path is None else path.absolute() for path in (self.lr, self.hr, self.preview))
-        return FrameFiles(self.number, lr, hr, self.output.absolute(), preview)
-
 
 @dataclass(frozen=True)
 class Shot:

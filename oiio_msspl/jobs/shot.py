@@ -112,6 +112,10 @@ def fuse_shot(
         raise InputError(f"--overwrite and {option} exclude each other: replace all frames, or leave some")
     if not isinstance(temporal, TemporalOptions):
         temporal = TemporalOptions(temporal)
+    if client is not None:  # workers have other working directories
+        lr, hr, output = None if lr is None else Path(lr).absolute(), Path(hr).absolute(), Path(output).absolute()
+        inputs = replace(inputs, map_file=inputs.map_file and inputs.map_file.absolute())
+        model = str(Path(model).absolute()) if model is not None and Path(model).is_file() else model
     shot = find_shot(lr, hr, output, frames)
     if previews:
         if view_transform is not None:

@@ -72,7 +72,7 @@ def connect(scheduler: str) -> Client:
 def fuse_frames(
     client: Client, settings: Settings, plan: ShotPlan, frames: list[FrameFiles]
 ) -> Iterator[tuple[FrameFiles, Outcome]]:
-    """Fuse frames on the workers.
+    """Fuse frames on the workers. All paths are absolute, because workers have other working directories.
 
     Yields:
         A frame as soon as it ends, in any order, with its outcome: None if its EXR already existed.
@@ -87,22 +87,18 @@ def fuse_frames(
     if not frames:
         return
     workers = _most_workers_on_a_machine(client)
-    if settings.model is not None and Path(settings.model).is_file():
-        settings = replace(settings, model=str(Path(settings.model).absolute()))
     address = client.scheduler.address
     run = uuid.uuid4().hex
     #: The chunks under way, and how often a frame of a chunk may still be tried again.
     futures: dict[Future, tuple[list[FrameFiles], int]] = {}
     # skip_existing lets a task that runs again keep its frames, and replace the preview that a dead worker left without
     # its EXR.
-    settings = replace(settings, inputs=settings.inputs.absolute(), skip_existing=True)
-    plan = plan.absolute()
+    settings = replace(settings, skip_existing=True)
     existing = ExistingResults(settings, plan)
 
     def submit(chunk: list[FrameFiles], tries: int) -> Future:
         key = f"msspl-fuse-{chunk[0].number}-{tries}-{run}"
-        task = [frame.absolute() for frame in chunk]
-        future = client.submit(_fuse_chunk, run, settings, plan, task, workers, key=key, retries=RETRIES)
+        future = client.submit(_fuse_chunk, run, settings, plan, chunk, workers, key=key, retries=RETRIES)
         futures[future] = chunk, tries
         return future
 

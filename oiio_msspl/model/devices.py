@@ -12,7 +12,7 @@ from importlib.metadata import distributions
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.model.runtime import CPU, Provider, available_providers, runtime_version
+from oiio_msspl.model.runtime import CPU, Provider, available_providers
 
 #: ``--device`` name -> onnxruntime execution provider.
 PROVIDERS = {
@@ -57,8 +57,8 @@ def require_device(device: str) -> None:
             f"install {package} again"
         )
     raise InputError(
-        f"--device {device}: the installed onnxruntime {runtime_version()} has no {PROVIDERS[device]}; "
-        f"usable here: {', '.join(usable)}; to add {device}, install {package} in its place"
+        f"--device {device}: the installed onnxruntime has no {PROVIDERS[device]}; usable here: {', '.join(usable)}; "
+        f"to add {device}, install {package} in its place"
     )
 
 

@@ -35,13 +35,6 @@ def available_providers() -> list[str]:
     return list(onnxruntime.get_available_providers())
 
 
-def runtime_version() -> str:
-    """Return the version of the installed onnxruntime."""
-    import onnxruntime
-
-    return str(onnxruntime.__version__)
-
-
 def load_network(
     path: str | Path, threads: int = 0, providers: Sequence[Provider] = ((CPU, {}),), *, optimise: bool = True
 ) -> Network:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare EXR files with a reference: scores, and a picture of the error."""
+"""Compare EXR files with a reference: scores, and the error of each pixel."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target
-from oiio_msspl.exr.preview import SOFTWARE, write_png
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import HALF_MAX, Array, repair
@@ -231,24 +230,12 @@ def _scale(window: Window, larger: Window) -> int | None:
     return next((scale for scale in (1, *SCALES) if all(a in (b // scale, -(-b // scale)) for a, b in sides)), None)
 
 
-def check_output(path: Path, kind: str, suffixes: Sequence[str], compared: Sequence[Path], *, overwrite: bool) -> None:
-    """Raise InputError if ``path`` has another suffix, or can't be written beside the files ``compared``."""
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{path}: {kind}; name it {suffixes[0]}")
+def check_page(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None:
+    """Raise InputError if ``path`` is not named as a page, or can't be written beside the files ``compared``."""
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: the page is HTML; name it .html")
     check_target(path, overwrite=overwrite)
     check_separate(compared, [path])
-
-
-def write_error_map(path: Path, comparison: Comparison, *, overwrite: bool) -> None:
-    """Write the :func:`error_levels` of the first image in :func:`error_colours` as a PNG.
-
-    Raises:
-        InputError: pixels can't be read, or ``path`` exists.
-        MssplError: the PNG can't be written.
-    """
-    picture = error_colours(error_levels(comparison.image(0), comparison.truth))
-    # Not the name of a preview, because fusing deletes old previews.
-    write_png(path, picture, software=f"{SOFTWARE} compare", overwrite=overwrite)
 
 
 def error_levels(image: Array, truth: Array) -> Array:

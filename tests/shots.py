@@ -5,6 +5,8 @@ import re
 
 import numpy as np
 
+from oiio_msspl.exr.preview import write_preview
+from oiio_msspl.exr.render import Window
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 
 HEIGHT, WIDTH = 32, 48
@@ -29,6 +31,12 @@ def make_shot(folder, count, lr="lr", hr="hr", first=1001):
         write_exr(folder / lr / f"lr.{frame}.exr", low_layers(frame))
         write_exr(folder / hr / f"beauty.{frame}.exr", layers(frame))
     return folder
+
+
+def write_png(path, *, overwrite=False):
+    """A preview of ours, black."""
+    window = Window(0, 0, 2, 2)
+    write_preview(path, np.zeros((2, 2, 3), np.float32), window, window, overwrite=overwrite)
 
 
 def contents(folder):

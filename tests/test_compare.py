@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores, and the picture of the error."""
+"""Scores, and the error of each pixel."""
 
 import numpy as np
 import OpenEXR
@@ -18,10 +18,8 @@ from oiio_msspl.compare import (
     score_images,
     scores,
     upsample_bicubic,
-    write_error_map,
 )
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.preview import is_our_preview, old_preview
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.image.colour import ACESCG, REC709, conversion
 from oiio_msspl.image.metrics import RELMSE_GHARBI, relmse
@@ -131,21 +129,13 @@ def test_pictures_of_two_parts_of_the_frame_are_refused(tmp_path):
         open_comparison([left], right)
 
 
-def test_scores_and_error_map_read_the_reference_once(tmp_path, monkeypatch):
+def test_scores_read_the_reference_once(tmp_path, monkeypatch):
     paths = [write_exr(tmp_path / f"{n}.exr", rgb(picture(32, 32, n))) for n in range(3)]
     comparison = open_comparison(paths[:2], paths[2])
     read, decode = [], ExrFile.read
     monkeypatch.setattr(ExrFile, "read", lambda self, *more: (read.append(self.path), decode(self, *more))[1])
     score_images(comparison)
-    write_error_map(tmp_path / "error.png", comparison, overwrite=False)
     assert read.count(paths[2]) == 1
-
-
-def test_an_error_map_is_no_preview(tmp_path):
-    """Fusing deletes the old preview beside a frame that it replaces."""
-    paths = [write_exr(tmp_path / f"{n}.exr", rgb(picture(32, 32, n))) for n in range(2)]
-    write_error_map(tmp_path / "0.png", open_comparison(paths[:1], paths[1]), overwrite=False)
-    assert not is_our_preview(tmp_path / "0.png") and old_preview(paths[0]) is None
 
 
 def views(path, image, names):

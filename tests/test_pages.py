@@ -60,7 +60,7 @@ NOT_RUN = {
 #: An option and its value -> the same.
 NOT_RUN_WITH = {"--scheduler": "needs a running Dask scheduler", "--device cuda": "needs a GPU"}
 #: Options that name what is written.
-OUTPUTS = ("-o", "--bundle", "--report", "--error-map", "--html")
+OUTPUTS = ("-o", "--bundle", "--report", "--html")
 #: Packages that pages install beside those of pyproject.toml.
 OTHER_PACKAGES = {
     "onnxruntime-gpu": "takes the place of onnxruntime",

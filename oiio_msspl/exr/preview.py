@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write 8-bit PNG pictures: the preview of the result, and pictures of display values."""
+"""Write the preview of the result, an 8-bit PNG."""
 
 from __future__ import annotations
 
@@ -91,20 +91,7 @@ def write_preview(
             linear = linear @ to_rec709
         return _srgb_pixels(linear) if view is None else _to_8_bits(_through_ocio(linear, view))
 
-    _write_png(path, display_window, rows, SOFTWARE, overwrite)
-
-
-def write_png(path: Path, display: Array, *, software: str = SOFTWARE, overwrite: bool = False) -> None:
-    """Write a PNG of display values (height, width, 3), clipped to [0, 1], atomically.
-
-    ``software`` is the PNG's "Software" entry. :func:`is_our_preview` takes a picture for a preview by it.
-
-    Raises:
-        InputError: ``path`` exists.
-        MssplError: the file can't be written.
-    """
-    whole = Window(0, 0, display.shape[1], display.shape[0])
-    _write_png(path, whole, lambda strip: _to_8_bits(display[strip.y0 : strip.y1]), software, overwrite)
+    _write_png(path, display_window, rows, overwrite)
 
 
 def _to_8_bits(display: Array) -> Pixels:
@@ -124,7 +111,7 @@ def _srgb_table() -> Pixels:
     return _to_8_bits(srgb(np.nan_to_num(halves, posinf=1, neginf=0)))
 
 
-def _write_png(path: Path, window: Window, rows: Callable[[Window], Pixels], software: str, overwrite: bool) -> None:
+def _write_png(path: Path, window: Window, rows: Callable[[Window], Pixels], overwrite: bool) -> None:
     """Write the pixels that ``rows`` gives for each strip of a window: a large frame needs no second copy."""
     with replacing(path, overwrite=overwrite) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
@@ -132,7 +119,7 @@ def _write_png(path: Path, window: Window, rows: Callable[[Window], Pixels], sof
             raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
         spec = oiio.ImageSpec(window.width, window.height, 3, "uint8")
         spec.attribute("oiio:ColorSpace", "sRGB")
-        spec.attribute("Software", software)
+        spec.attribute("Software", SOFTWARE)
         spec.attribute("png:compressionLevel", 1)
         # Filter "Sub": every byte minus that of the pixel to the left. Trying all filters would take longer than zlib.
         spec.attribute("png:filter", 16)

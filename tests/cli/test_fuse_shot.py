@@ -12,10 +12,9 @@ import time
 import numpy as np
 import pytest
 
-from oiio_msspl.exr.preview import write_png
 from tests.conftest import read_bits, write_exr
 from tests.programs import fuse, leave_temporary, start
-from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot
+from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot, write_png
 
 
 @pytest.mark.parametrize(
@@ -174,7 +173,7 @@ def test_a_shot_killed_three_times_and_resumed_is_whole(tmp_path, bilinear_model
             assert not json.loads((folder / "r.json").read_text())["finished"]
     # What a kill in the middle of writing leaves, should the three moments have missed it.
     leave_temporary(folder / "out/beauty.1100.exr")
-    write_png(folder / "out/beauty.1100.png", np.zeros((2, 2, 3)), overwrite=True)
+    write_png(folder / "out/beauty.1100.png", overwrite=True)
 
     last = start_shot(folder, bilinear_models[4])
     last.communicate()

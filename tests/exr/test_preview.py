@@ -10,9 +10,10 @@ import OpenImageIO as oiio
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.preview import SOFTWARE, check_view, is_our_preview, write_png, write_preview
+from oiio_msspl.exr.preview import check_view, is_our_preview, write_preview
 from oiio_msspl.exr.render import Window
 from oiio_msspl.image.colour import srgb
+from tests.shots import write_png
 
 
 def png(path):
@@ -51,14 +52,9 @@ def test_light_beyond_half_floats_is_white_and_what_is_no_number_is_black(tmp_pa
     assert png(tmp_path / "a.png").tolist() == [[[255] * 3, [0] * 3]]
 
 
-def test_display_values_are_written_as_they_are_and_clipped(tmp_path):
-    values = np.array([[[-1, 0, 0.5], [1, 2, 0.25]]], np.float32)
-    write_png(tmp_path / "a.png", values)
-    np.testing.assert_array_equal(png(tmp_path / "a.png"), [[[0, 0, 128], [255, 255, 64]]])
-
-
 def test_rows_are_stored_with_the_filter_that_is_fast(tmp_path):
-    write_png(tmp_path / "a.png", np.random.default_rng(0).random((5, 7, 3), np.float32))
+    window = Window(0, 0, 7, 5)
+    write_preview(tmp_path / "a.png", np.random.default_rng(0).random((5, 7, 3), np.float32), window, window)
     data = (tmp_path / "a.png").read_bytes()
     start = data.index(b"IDAT")
     length = int.from_bytes(data[start - 4 : start], "big")
@@ -67,12 +63,10 @@ def test_rows_are_stored_with_the_filter_that_is_fast(tmp_path):
 
 
 def test_our_previews_are_told_from_other_pictures(tmp_path):
-    write_png(tmp_path / "ours.png", np.zeros((4, 4, 3), np.float32))
-    write_png(tmp_path / "tool.png", np.zeros((4, 4, 3), np.float32), software=f"{SOFTWARE} compare")
+    write_png(tmp_path / "ours.png")
     oiio.ImageBuf(np.zeros((4, 4, 3), np.float32)).write(str(tmp_path / "other.png"))
     (tmp_path / "text.png").write_text("no picture")
     assert is_our_preview(tmp_path / "ours.png")
-    assert not is_our_preview(tmp_path / "tool.png")
     assert not is_our_preview(tmp_path / "other.png")
     assert not is_our_preview(tmp_path / "text.png")
 
@@ -86,7 +80,7 @@ def test_an_unknown_view_is_refused_with_those_that_exist(tmp_path):
 def test_a_picture_is_not_overwritten_without_being_told(tmp_path):
     (tmp_path / "a.png").write_text("old")
     with pytest.raises(InputError, match="pass --overwrite"):
-        write_png(tmp_path / "a.png", np.zeros((4, 4, 3), np.float32))
+        write_png(tmp_path / "a.png")
     assert (tmp_path / "a.png").read_text() == "old"
 
 
@@ -94,9 +88,11 @@ def test_a_picture_is_not_overwritten_without_being_told(tmp_path):
 def test_a_picture_whose_last_bytes_cannot_be_written_is_none(tmp_path):
     """OpenImageIO does not tell. The limit of a process stands for a full disk."""
     code = (
-        "import resource, sys, numpy as np; from pathlib import Path; from oiio_msspl.exr.preview import write_png;"
+        "import resource, sys, numpy as np; from pathlib import Path;"
+        "from oiio_msspl.exr.preview import Window, write_preview;"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000));"
-        "write_png(Path(sys.argv[1]), np.random.default_rng(0).random((256, 256, 3), np.float32))"
+        "image, window = np.random.default_rng(0).random((256, 256, 3), np.float32), Window(0, 0, 256, 256);"
+        "write_preview(Path(sys.argv[1]), image, window, window)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.png")], capture_output=True, text=True)
     assert "MssplError" in done.stderr and "is the disk full?" in done.stderr and not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
-from oiio_msspl.exr.preview import is_our_preview, write_png
+from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.jobs import settings as job_settings
@@ -24,7 +24,7 @@ from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from tests.conftest import HEADER_ONLY, downsample, picture, read_bits, rgb, write_exr
 from tests.programs import leave_temporary
-from tests.shots import HEIGHT, WIDTH, layers, low_layers
+from tests.shots import HEIGHT, WIDTH, layers, low_layers, write_png
 
 
 @pytest.fixture
@@ -195,7 +195,7 @@ def test_a_new_frame_never_keeps_the_preview_of_the_old_one(pair, tmp_path, bili
 
     for preview, writes in ((None, writing.write_preview), (png, full_disk)):
         out.write_text("old")
-        write_png(png, np.zeros((2, 2, 3)), overwrite=True)
+        write_png(png, overwrite=True)
         monkeypatch.setattr(writing, "write_preview", writes)
         fuse_files(*pair, out, model=model, preview_path=preview, overwrite=True)
         assert not png.exists()
@@ -207,7 +207,7 @@ def test_a_new_frame_never_keeps_the_preview_of_the_old_one(pair, tmp_path, bili
 def test_an_old_frame_that_can_not_be_replaced_keeps_its_preview(pair, tmp_path, bilinear_models, monkeypatch):
     out, png = tmp_path / "out.exr", tmp_path / "out.png"
     out.write_text("old")
-    write_png(png, np.zeros((2, 2, 3)))
+    write_png(png)
     monkeypatch.setattr("oiio_msspl.exr.writer._write_parts", lambda *_: (_ for _ in ()).throw(MssplError("full")))
     with pytest.raises(MssplError, match="full"):
         fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=png, overwrite=True)

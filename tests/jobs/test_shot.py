@@ -19,7 +19,6 @@ from oiio_msspl import InputError, InputOptions, MssplError, fuse_files, fuse_sh
 from oiio_msspl._version import full_version
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
-from oiio_msspl.exr.preview import write_png
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.jobs import existing, memory, pipeline, shot, shot_report, write
 from oiio_msspl.jobs import run as run_module
@@ -29,7 +28,7 @@ from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.shot_report import fused_result, read_earlier
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
-from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot
+from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot, write_png
 
 
 def run(folder, model, **more):
@@ -338,7 +337,7 @@ def test_a_picture_that_is_no_preview_of_ours_is_left_alone(tmp_path, bilinear_m
     mine = folder / "out/beauty.1001.png"
     oiio.ImageBuf(oiio.ImageSpec(4, 4, 3, "uint8")).write(str(mine))
     before = mine.read_bytes()
-    write_png(folder / "out/beauty.1002.png", np.zeros((2, 2, 3)))  # of a run that was killed
+    write_png(folder / "out/beauty.1002.png")  # of a run that was killed
     report = run(folder, bilinear_models[4], previews=True, skip_existing=True)
     assert [report.results[n].status for n in (1001, 1002)] == ["failed", "fused"]
     assert "beauty.1001.png: exists; pass --overwrite" in report.results[1001].message

@@ -21,8 +21,6 @@ EXAMPLES = """[bold]Examples[/bold]
 
   msspl compare out.exr hr.exr lr.exr --reference ref.exr
 
-  msspl compare out.exr -r ref.exr --error-map error.png
-
   msspl compare out.exr hr.exr -r ref.exr --map rgb=light_key
 
   msspl compare out.exr hr.exr lr.exr -r ref.exr --html page.html --layers 'light*'
@@ -33,8 +31,7 @@ LARGE_PAGE = 60_000_000
 
 
 _REFERENCE = "Measure against this converged render. Only --html works without it."
-_ERROR_MAP = "Write a picture of the first image's error (log RelMSE; dark is small)."
-_HTML = "Write a page to look at all pictures in a browser, with their layers."
+_HTML = "Write a page to look at all pictures in a browser, with their layers and errors."
 _LAYERS = "Show these layers on the page (light*). May be repeated. \\[default: those that sum to the beauty]"
 _MAP = "Compare this layer of all files instead of their beauty."
 
@@ -42,7 +39,6 @@ _MAP = "Compare this layer of all files instead of their beauty."
 def compare(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="EXRs to measure.", show_default=False)],
     reference: Annotated[Path | None, option(None, _REFERENCE, "--reference", "-r", metavar="EXR")] = None,
-    error_map: Annotated[Path | None, option(None, _ERROR_MAP, metavar="PNG")] = None,
     html: Annotated[Path | None, option(None, _HTML, metavar="HTML")] = None,
     layers: Annotated[list[str], option(None, _LAYERS, metavar="PATTERN")] = [],  # noqa: B006
     mapping: Annotated[list[str], option(None, _MAP, "--map", metavar="rgb=LAYER")] = [],  # noqa: B006
@@ -58,7 +54,7 @@ def compare(
     with several views, the first view of the first image is compared.
     """
     from oiio_msspl.compare import (
-        check_output,
+        check_page,
         note_on_spaces,
         note_on_views,
         note_on_weights,
@@ -66,28 +62,19 @@ def compare(
         notes_on_broken,
         open_comparison,
         score_images,
-        write_error_map,
     )
-    from oiio_msspl.compare_page import check_layers
 
-    if reference is None and (html is None or error_map is not None):
-        raise InputError("scores and error maps need --reference; without one, --html writes a page to look at")
+    if reference is None and html is None:
+        raise InputError("scores need --reference; without one, --html writes a page to look at")
     if layers and html is None:
         raise InputError("--layers chooses the layers of the page; add --html PAGE")
-    compared = [*images, reference] if reference else images
-    if error_map is not None:
-        check_output(error_map, "the error map is a PNG", (".png",), compared, overwrite=overwrite)
     if html is not None:
-        check_output(html, "the page is HTML", (".html", ".htm"), compared, overwrite=overwrite)
+        check_page(html, [*images, reference] if reference else images, overwrite=overwrite)
     comparison = open_comparison(images, reference, _layer(mapping))
-    if html is not None:
-        check_layers(comparison, layers)
     for note_on in (note_on_views, note_on_windows, note_on_spaces, note_on_weights):
         if note := note_on(comparison):
             console.say(note, error=True)
     results = score_images(comparison) if reference else [{} for _ in images]
-    if error_map is not None:
-        write_error_map(error_map, comparison, overwrite=overwrite)
     for note in notes_on_broken(comparison):
         console.say(f"warning: {note}", error=True)
     wrote = _write_page(html, comparison, layers, overwrite) if html else ""

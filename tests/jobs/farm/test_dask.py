@@ -9,12 +9,10 @@ import time
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from oiio_msspl import InputError, MssplError, fuse_shot
 from oiio_msspl.exr.atomic import replacing
-from oiio_msspl.exr.preview import write_png
 from oiio_msspl.jobs import pipeline
 from oiio_msspl.jobs.farm import dask as dask_cluster
 from oiio_msspl.jobs.farm.dask import _sessions, connect, fuse_frames
@@ -26,7 +24,7 @@ from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Reach
 from tests.jobs.test_over_time import make_shot_with_passes
 from tests.programs import fuse
-from tests.shots import contents, make_shot
+from tests.shots import contents, make_shot, write_png
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +55,7 @@ def hang_in_writing(marker):
     """In a worker: leave what there is in the middle of writing a frame, tell, and go no further."""
 
     def write(frame, existing):
-        write_png(frame.report.preview, np.zeros((2, 2, 3)))  # of a frame that is not there
+        write_png(frame.report.preview)  # of a frame that is not there
         with replacing(frame.report.output) as temporary:
             temporary.write_bytes(b"half")
             marker.touch()

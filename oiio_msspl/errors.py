@@ -7,17 +7,11 @@ import errno
 import os
 import unicodedata
 
-from oiio_msspl.wording import worded
-
 
 class MssplError(Exception):
     """A failure that the caller could not have avoided (exit code 1)."""
 
     exit_code = 1
-
-    def __str__(self) -> str:
-        """Return the sentence, see :func:`oiio_msspl.wording.worded`."""
-        return worded(super().__str__())
 
 
 class InputError(MssplError):
@@ -58,7 +52,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, MssplError):
         return str(error), error.exit_code
     if isinstance(error, MemoryError):
-        return worded("out of memory; try a smaller --max-memory"), 1
+        return "out of memory; try a smaller --max-memory", 1
     if isinstance(error, OSError):
         path = error.filename2 or error.filename
         name = os.fsdecode(path) if isinstance(path, str | bytes | os.PathLike) else ""
@@ -70,4 +64,4 @@ def explain(error: Exception) -> tuple[str, int]:
         if "temporary directory" in str(error.strerror):  # tempfile has tried all folders that it knows
             reason = f"no folder for temporary files can be used ({error.strerror})"
             return f"{reason}; free space, or export TMPDIR=/another/folder", 1
-    return worded(f"unexpected {type(error).__name__}: {error} (--debug shows where)"), 1
+    return f"unexpected {type(error).__name__}: {error} (--debug shows where)", 1

@@ -30,7 +30,6 @@ from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
 from oiio_msspl.jobs.sequence import is_sequence, next_file
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
-from oiio_msspl.wording import worded
 
 
 @dataclass
@@ -283,7 +282,7 @@ def _pixel_facts(render: MappedRender) -> list[str]:
     if brightest[RGB] == 0:
         bright = ", ".join(name for name, value in brightest.items() if value > 0 and name != "alpha")
         hint = f", though others are not: {bright}; check which layer it is (--map rgb=LAYER)" if bright else ""
-        render.notes.append(worded(f"the beauty is black everywhere{hint}"))
+        render.notes.append(f"the beauty is black everywhere{hint}")
     counts = [f"{name}: {n} values are NaN or infinite; fusing repairs them" for name, n in not_finite.items() if n]
     for name, count in negative.items():
         if count:

@@ -9,7 +9,6 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from oiio_msspl import wording
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
 from oiio_msspl.model.encoding import MAX_RADIANCE
 
@@ -36,12 +35,6 @@ def pytest_collection_modifyitems(config, items):
     if not config.option.file_or_dir and not config.option.markexpr:
         config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("slow")])
         items[:] = [item for item in items if not item.get_closest_marker("slow")]
-
-
-@pytest.fixture(autouse=True)
-def _options_in_messages(monkeypatch):
-    """Read messages as the programs word them; test_wording.py reads them as Python does."""
-    monkeypatch.setattr(wording, "for_command_line", True)
 
 
 def pytest_addoption(parser):

@@ -11,14 +11,12 @@ import traceback
 
 import typer
 
-from oiio_msspl import wording
 from oiio_msspl.errors import explain, printable
 from oiio_msspl.image.parallel import end_pools
 
 
 def run(app: typer.Typer) -> None:
     """Run a program and exit. Typer itself ends wrong usage with exit code 2. ``--debug`` shows the traceback."""
-    wording.for_command_line = True
     _exit_on_signals()
     _make_streams_usable()
     try:

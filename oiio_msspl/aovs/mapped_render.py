@@ -19,7 +19,6 @@ from oiio_msspl.exr.reader import Channel, ExrFile, adjacent
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.image.arrays import Array, blank, unload
 from oiio_msspl.image.colour import REC709, ColourSpace
-from oiio_msspl.wording import worded
 
 #: Rows that are read at a time: decoded channels take memory beside the features that are made of them.
 ROWS_PER_LOAD = 256
@@ -206,7 +205,7 @@ def origin(row: Mapping[str, str]) -> str:
     status, source = row["status"], row["source"] + (f" ({row['note']})" if row["note"] else "")
     if status == "default":  # features are optional, but without an albedo textures are lost
         hint = "none: expect blur, render an albedo (or name it with --map albedo=LAYER)"
-        return worded(hint) if row["feature"] == ALBEDO else "none (optional)"
+        return hint if row["feature"] == ALBEDO else "none (optional)"
     if status == "unused":
         return f"not read: {source}"
     return "none" if status == "absent" else f"{status}: {source}"

@@ -35,7 +35,6 @@ from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import Array
-from oiio_msspl.wording import worded
 
 #: Bands of rows that tell whether normals are signed, and rows of a band.
 _BANDS_OF_NORMALS, _ROWS_PER_BAND = 8, 8
@@ -189,7 +188,7 @@ def _drop_unusable_variance(render: MappedRender) -> None:
             f"variance: '{formula.text}' is {formula.kind.replace('_', ' ')}, which needs the samples per pixel; "
             "the header does not say, so it is not used (--hr-spp says them)"
         )
-        render.notes.append(worded(text))
+        render.notes.append(text)
 
 
 def _decide_normal_encoding(render: MappedRender) -> None:

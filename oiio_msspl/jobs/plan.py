@@ -26,7 +26,6 @@ from oiio_msspl.jobs.sequence import FrameFiles, Shot
 from oiio_msspl.jobs.settings import family_for_layers
 from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline
 from oiio_msspl.model.catalogue import QUALITIES, family_of
-from oiio_msspl.wording import worded
 
 log = logging.getLogger(__name__)
 
@@ -155,7 +154,7 @@ def plan_temporal(
     count = options.count(_family_of_shot(mapped, frames, model))
     plan, text = _plan_view(_motion_of(mapped, numbers, inputs, options, required=asked), count, asked=asked)
     if plan is None:
-        return ShotPlan(text=worded(text))
+        return ShotPlan(text=text)
     views: dict[str | None, ViewPlan] = {None: plan}
     labels = _other_views(mapped, numbers[:PAIRS_JUDGED], inputs, write)
     for label in labels:
@@ -165,7 +164,7 @@ def plan_temporal(
             text += f"; {name_of(label)} {reason}"
         else:
             views[label] = plan
-    return ShotPlan(frames, views, worded(text), frozenset(labels))
+    return ShotPlan(frames, views, text, frozenset(labels))
 
 
 def _family_of_shot(mapped: Callable[[int], MappedPair], numbers: Iterable[int], model: str | None) -> str | None:

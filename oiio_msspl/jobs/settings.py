@@ -33,7 +33,6 @@ from oiio_msspl.model.catalogue import (
 )
 from oiio_msspl.model.contract import CLEAN, ONE_SIZE, SPREAD
 from oiio_msspl.model.session import Session
-from oiio_msspl.wording import worded
 
 #: What notes say of noise, by the ending of the family that suits it.
 NOISE = {
@@ -136,7 +135,7 @@ def choose_model(
         suited = for_spread_noise(model)
         spread = suited is not None and is_noise_spread(*renders(), alignment)
         if spread:
-            hr.notes.append(worded(f"{NOISE[SPREAD]}, and {model} leaves such noise; use --model {suited}"))
+            hr.notes.append(f"{NOISE[SPREAD]}, and {model} leaves such noise; use --model {suited}")
         return model, spread is not None
     suited = family_for_layers(hr, family)
     if suited != family:

@@ -38,7 +38,6 @@ from oiio_msspl.jobs.sequence import FrameFiles, find_shot
 from oiio_msspl.jobs.settings import Settings, bytes_of
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.model.devices import require_device
-from oiio_msspl.wording import worded
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -141,9 +140,7 @@ def fuse_shot(
     running = _RunningReport(report, path, progress, start)
     existing = ExistingResults(settings, plan)
     if odd := existing.dated_in_future(shot.frames):
-        log.warning(
-            worded(f"{odd}: is dated in the future, so --update can't tell what is newer; set its date (touch)")
-        )
+        log.warning("%s: is dated in the future, so --update can't tell what is newer; set its date (touch)", odd)
     to_fuse, skipped = running.add_known(existing, earlier)
     if to_fuse:
         with limit_threads(threads):

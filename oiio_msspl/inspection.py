@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD, MappedRender
 from oiio_msspl.aovs.motion import user_fields
@@ -51,10 +50,6 @@ class Inspection:
     """Source of the movement to the next frame; None if the next frame does not lie beside this one."""
     noise: str | None = None
     """``independent`` or ``spread`` over neighbouring pixels, by :func:`inspect_noise`; None if it is unknown."""
-    fused_sets: list[AdditiveSet] = field(default_factory=list)
-    """Additive sets of all views that sum to their beauty."""
-    unused: list[str] = field(default_factory=list)
-    """Names of the layers and channels that are neither read nor fused."""
     advice: list[Finding] = field(default_factory=list)
     """What more would help, and what it costs, by :func:`inspect_noise`."""
     problems: list[str] = field(default_factory=list)
@@ -123,7 +118,6 @@ class Inspection:
                 "model": self.model,
                 "aovs": self.aovs(),
                 "notes": self.render.notes,
-                "unused": self.unused,
                 "motion_layers": {vectors.name: str(vectors.format) for vectors in self.render.motion.fields},
                 "noise": self.noise,
                 "advice": [as_data(text) for text in self.advice],
@@ -161,16 +155,15 @@ def inspect_file(
         result.facts = _facts(file)
         render = result.render = map_hrls(file, inputs).for_model(contract.hrls)
         result.facts.append(_renderer_fact(render))
-        result.facts += [*_pixel_facts(render), *_look_at_sets(result, render)]
+        result.facts += [*_pixel_facts(render), *_facts_of_sets(render)]
         for label in render.other_views if inputs.view is None else ():
             try:
                 view = map_other_hrls(render, label, inputs).for_model(contract.hrls)
-                facts = [*_pixel_facts(view), *_look_at_sets(result, view)]
+                facts = [*_pixel_facts(view), *_facts_of_sets(view)]
                 result.other_views.append(view)
             except InputError as error:
                 facts = [f"can't be fused: {str(error).removeprefix(f'{path}: ')}"]
             result.facts += [f"{name_of(label)}: {fact}" for fact in facts]
-        result.unused = render.unused_layers(result.other_views, result.fused_sets)
         _inspect_motion(result, render, inputs, motion_format)
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
@@ -202,15 +195,8 @@ def inspect_noise(inspections: Sequence[Inspection]) -> None:
     high.facts.append(f"noise{compared}: {text}")
 
 
-def _look_at_sets(result: Inspection, render: MappedRender) -> list[str]:
-    """Describe the additive sets of a view, and add those that sum to the beauty to the result."""
-    facts = []
-    for additive in render.additive_sets:
-        check = check_sum(render, additive)
-        facts.append(f"{additive.name} ({additive.layer_names}): {check.text}")
-        if not check.problem:
-            result.fused_sets.append(additive)
-    return facts
+def _facts_of_sets(render: MappedRender) -> list[str]:
+    return [f"{each.name} ({each.layer_names}): {check_sum(render, each).text}" for each in render.additive_sets]
 
 
 def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptions, motion_format: str | None) -> None:

@@ -14,7 +14,6 @@ from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, FEATURES, PAPER_FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.motion import MotionLayers
-from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import Channel, ExrFile, adjacent
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.image.arrays import Array, blank, unload
@@ -103,23 +102,6 @@ class MappedRender:
         features = {name: formula for name, formula in self.features.items() if name not in unread}
         notes = [note for note in self.notes if note.partition(":")[0] not in unread]
         return replace(self, features=features, notes=notes)
-
-    def unused_layers(self, views: Sequence[MappedRender], fused: Iterable[AdditiveSet]) -> list[str]:
-        """Name the flat layers that are neither read as features nor fused.
-
-        ``views`` are the file, mapped for the other views, and ``fused`` the additive sets that are fused. Of a layer
-        that is read in part or has no name, the channels are named. The view follows in brackets if it is not the
-        chosen one.
-        """
-        used = {c for view in (self, *views) for formula in view.formulas.values() for c in formula.channels}
-        used |= {channel for additive in fused for layer in additive.layers for channel in layer.channels}
-        names = []
-        for layer in layers_of(self.file):
-            rest = [c for c in layer.channels.values() if c not in used]
-            whole = len(rest) == len(layer.channels) and layer.name
-            view = f" ({layer.view})" if layer.view and layer.view not in self.view.split("/") else ""
-            names += [name + view for name in ([layer.name] if whole else [c.name for c in rest])]
-        return names
 
     @property
     def formulas(self) -> dict[str, FeatureFormula]:

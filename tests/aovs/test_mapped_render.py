@@ -9,7 +9,6 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
 from tests.aovs.renders import H, W, layer, mapped, plane, sources
 from tests.conftest import EXAMPLES, SHARED, needs_shared, picture, rgb, write_exr
-from tests.exr.sources import behind_a_deep_part
 
 
 @pytest.mark.parametrize(
@@ -82,7 +81,6 @@ def test_layers_of_another_view_are_told_apart(tmp_path):
     channels = layer("", 1) | layer("albedo", 2) | layer("right", 3) | layer("albedo.right", 4)
     render = mapped(tmp_path, channels, attributes={"multiView": ["left", "right"]})
     assert (render.view, sources(render)["albedo"]) == ("left", "albedo")
-    assert render.unused_layers([], []) == ["albedo (right)", "right.R (right)", "right.G (right)", "right.B (right)"]
 
 
 def test_each_view_has_the_attributes_of_its_own_part(tmp_path):
@@ -105,18 +103,6 @@ def test_the_beauty_channels_are_those_that_a_fused_frame_replaces(tmp_path):
     assert [c.name for c in with_alpha.beauty_channels] == ["C.R", "C.G", "C.B", "C.A"]
     without = mapped(tmp_path, layer("", 1) | layer("albedo", 2))
     assert [c.name for c in without.beauty_channels] == ["R", "G", "B"]
-
-
-def test_layers_that_no_feature_is_read_from_are_named(tmp_path):
-    """A layer that is read in part is named by its other channels."""
-    channels = layer("", 1) | layer("albedo", 2, "RGBA") | layer("mask", 3) | {"Z": plane(1)}
-    assert mapped(tmp_path, channels).unused_layers([], []) == ["Z", "albedo.A", "mask"]
-
-
-def test_a_deep_part_hides_no_layer_that_is_not_read(tmp_path):
-    """Nor does it show its own: it is not passed on."""
-    path = behind_a_deep_part(tmp_path / "hr.exr", layer("", 1, "RGBA") | {"Z": plane(1)})
-    assert map_render(open_exr(path)).unused_layers([], []) == ["Z"]
 
 
 def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):

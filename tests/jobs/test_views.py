@@ -295,7 +295,6 @@ def test_check_and_inspect_look_at_all_views(tmp_path):
     assert [view.view for view in found.other_views] == ["bg"]
     assert any(fact.startswith("bg: light groups (Combined_fill, Combined_key): sums") for fact in found.facts)
     assert found.as_dict()["facts"] == found.facts
-    assert found.unused == []
     assert inspect_file(pair[1], InputOptions(view="fg")).other_views == []
 
 

@@ -61,8 +61,6 @@ def inspect(
             if inspection.render is not None:
                 console.say(f"  what {inspection.model} would read:")
                 console.aov_table(inspection.aovs(), inspection.render.notes)
-                if inspection.unused:
-                    console.say(f"  neither read nor fused: {', '.join(inspection.unused)}")
             for text in inspection.advice:
                 console.say(f"  advice: {text}")
             for problem in inspection.problems:

@@ -6,7 +6,6 @@ fileseq reads padding and frame ranges. Where its reading differs from what comp
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 from collections.abc import Iterable
@@ -17,8 +16,6 @@ import fileseq
 
 from oiio_msspl.aovs.renderers import aov_files
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.model.contract import SCALES
 
 #: The frame number in a pattern, as Nuke, Katana, Python and Houdini write it. fileseq reads all of these, but splits
 #: the name around them differently: it takes the digits of ``v2####.exr`` for a frame range, it finds no number in
@@ -351,34 +348,13 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
     if lr == hr:
         why = "both are to be in one folder"
     raise InputError(
-        f"which sequences belong together? {seen}, and {why}; "
-        f"name the two, the low-resolution one first{_example(pairs or list(itertools.product(lows, highs)))}"
+        f"which sequences belong together? {seen}, and {why}; name the two as patterns, the low-resolution one first"
     )
 
 
 def _with_aovs(sequences: list[Sequence]) -> list[Sequence]:
     """Return the sequences beside whose files lie files of albedo or normals; all if there are none."""
     return [sequence for sequence in sequences if aov_files(next(iter(sequence.files.values())))] or sequences
-
-
-def _example(pairs: list[tuple[Sequence, Sequence]]) -> str:
-    """Write the end of that message: the first two whose sizes fit; empty if none do."""
-    # Short names come first, because single layers in files of their own have longer ones.
-    for low, high in sorted(pairs, key=lambda pair: sum(len(sequence.pattern.name) for sequence in pair)):
-        widths = [_width(next(iter(sequence.files.values()))) for sequence in (low, high)]
-        if all(widths) and any(abs(widths[1] - scale * widths[0]) < scale for scale in SCALES):
-            return f", such as {low.pattern} {high.pattern}"
-    return ""
-
-
-def _width(path: Path) -> int:
-    """Return the width of a render in pixels; 0 for a file that can't be read and for a fused one."""
-    try:
-        file = open_exr(path)
-    except InputError:
-        return 0
-    file.close()
-    return 0 if "msspl/version" in file.metadata else file.display_window.width
 
 
 def _output_pattern(output: Path, hr: Pattern) -> tuple[bool, Pattern]:

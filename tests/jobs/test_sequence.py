@@ -15,7 +15,6 @@ from oiio_msspl.jobs.sequence import (
     parse_frames,
     parse_pattern,
 )
-from tests.conftest import picture, rgb, write_exr
 
 
 def touch(folder, *names):
@@ -135,19 +134,10 @@ def test_folders_that_leave_a_doubt_are_explained(tmp_path, lr, hr, message):
         find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
 
 
-def test_a_folder_with_both_sequences_is_explained_by_two_patterns(tmp_path):
-    """By their sizes, which may be rounded. Files of one layer have longer names, and results are no renders."""
-    folder = touch(tmp_path / "both", "broken.1.exr")
-    for name, size, header in (
-        ("beauty", 31, {}),
-        ("beauty.albedo", 31, {}),
-        ("lr", 16, {}),
-        ("lr.albedo", 16, {}),
-        ("a", 31, {"msspl/version": "1"}),
-    ):
-        write_exr(folder / f"{name}.1.exr", rgb(picture(size, size)), **header)
-    message = f"both are to be in one folder; name the two, the low-resolution one first, such as {folder}/lr.#.exr "
-    with pytest.raises(InputError, match=f"{re.escape(message)}{re.escape(str(folder))}/beauty.#.exr$"):
+def test_a_folder_with_both_sequences_is_explained(tmp_path):
+    folder = touch(tmp_path / "both", "beauty.1.exr", "lr.1.exr")
+    message = "both are to be in one folder; name the two as patterns, the low-resolution one first"
+    with pytest.raises(InputError, match=message):
         find_shot(folder, folder, tmp_path / "out")
 
 

@@ -109,12 +109,6 @@ class FrameReport:
         """Return the reports of all views that were fused, the first one in front; none for a file with one view."""
         return [self, *self.other_views] if self.hr.other_views else []
 
-    @property
-    def tiles_of_views(self) -> list[int]:
-        """Tiles of each view that was fused, the first one in front."""
-        others = [view.tiles for view in self.other_views]
-        return [self.tiles - sum(others), *others]
-
     def found_lrhs_aovs(self) -> dict[str, str]:
         """Return the features of ``lrhs_aovs`` that the LRHS has, with their layers."""
         names = () if self.is_one_render else self.lrhs_aovs

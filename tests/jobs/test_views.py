@@ -311,11 +311,6 @@ def test_progress_covers_the_tiles_and_the_passes_of_all_views_and_writing(tmp_p
     assert (shares[0], told[-1]) == (0, 1) and 0.5 < told[at - 1] < 1
 
 
-def test_a_report_tells_the_tiles_of_each_view(tmp_path, bilinear_models):
-    report, _ = fused(write_layers(tmp_path), tmp_path / "out.exr", bilinear_models)
-    assert (report.tiles, report.tiles_of_views) == (2, [1, 1])
-
-
 def test_memory_holds_one_view_at_a_time(tmp_path, bilinear_models, monkeypatch):
     """Every view is fused with the whole of the memory, and the others are on the disk by then."""
     pair = write_layers(tmp_path)

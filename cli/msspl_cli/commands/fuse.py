@@ -19,7 +19,6 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.image.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from contextlib import AbstractContextManager
 
     from dask.distributed import Client
@@ -262,8 +261,7 @@ def _print(report: FrameReport, seconds: float) -> None:
             console.say(f"{text}: {', '.join(f'{count} in {name}' for name, count in counts.items())}")
     stages = {"read": "loading", "fuse": "fusing", "write": "writing"}
     times = ", ".join(f"{report.seconds[key]:.1f} s {stage}" for key, stage in stages.items())
-    tiles = tiles_in_words(report.tiles_of_views)
-    console.say(f"Fused with {report.model} {_device(report)}{tiles} in {seconds:.1f} s ({times}).")
+    console.say(f"Fused with {report.model} {_device(report)} in {seconds:.1f} s ({times}).")
     console.say(f"Wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))
 
 
@@ -274,11 +272,3 @@ def _device(report: FrameReport) -> str:
     on_cpu = report.convolutions.get("CPUExecutionProvider", 0)
     rest = f", {on_cpu} of {sum(report.convolutions.values())} convolutions on the CPU," if on_cpu else ""
     return f"on {provider}{rest}"
-
-
-def tiles_in_words(tiles: Sequence[int]) -> str:
-    """Say in how many tiles each view was fused, from their numbers by view; nothing if each view is one tile."""
-    least, most = min(tiles), max(tiles)
-    if most == 1:
-        return ""
-    return f" in {most if least == most else f'{least} to {most}'} tiles{' a view' if len(tiles) > 1 else ''}"

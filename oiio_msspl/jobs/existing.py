@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,9 +22,6 @@ from oiio_msspl.jobs.timeline import neighbours
 from oiio_msspl.model.catalogue import model_files
 from oiio_msspl.model.contract import ONE_SIZE, SCALES
 from oiio_msspl.model.digests import as_text, digests
-
-#: Seconds by which the clocks of two machines may differ.
-CLOCK_SKEW = 60
 
 
 @dataclass(frozen=True)
@@ -60,14 +56,6 @@ class ExistingResults:
         renders = [path for frame in (files, *map(self.plan.frames.__getitem__, beside)) for path in frame.pair]
         paths = files_by_name(renders, self.settings.inputs, self.settings.model)
         return [path for path in paths if path.is_file() and path.stat().st_mtime > written]
-
-    def dated_in_future(self, frames: Sequence[FrameFiles]) -> Path | None:
-        """Return a file whose date lies in the future, so that ``update`` can't tell what is newer; None without."""
-        if not self.settings.update:
-            return None
-        latest = time.time() + CLOCK_SKEW
-        paths = (path for files in frames for path in (files.lr, files.hr, files.output) if path and path.is_file())
-        return next((path for path in paths if path.stat().st_mtime > latest), None)
 
     def known_result(self, files: FrameFiles, shot: Shot) -> FrameResult | None:
         """Return the result of a frame that need not or can't be fused; None for a frame to fuse."""

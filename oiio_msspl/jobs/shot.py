@@ -138,10 +138,7 @@ def fuse_shot(
     make_folder(folder)
     check_folder(shot.output.path(0))
     running = _RunningReport(report, path, progress, start)
-    existing = ExistingResults(settings, plan)
-    if odd := existing.dated_in_future(shot.frames):
-        log.warning("%s: is dated in the future, so --update can't tell what is newer; set its date (touch)", odd)
-    to_fuse, skipped = running.add_known(existing, earlier)
+    to_fuse, skipped = running.add_known(ExistingResults(settings, plan), earlier)
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model, error=write.error_layer))

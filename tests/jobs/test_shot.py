@@ -5,7 +5,6 @@ import json
 import os
 import re
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import SimpleNamespace
@@ -22,7 +21,6 @@ from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.jobs import existing, memory, pipeline, shot, shot_report, write
 from oiio_msspl.jobs import run as run_module
-from oiio_msspl.jobs.existing import CLOCK_SKEW
 from oiio_msspl.jobs.plan import TemporalOptions
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.shot_report import fused_result, read_earlier
@@ -853,21 +851,6 @@ def test_a_report_of_another_version_does_not_stop_a_resumed_shot(tmp_path):
     path.write_text(json.dumps({"frames": [], "first_fused": "1001"}))
     with pytest.raises(InputError, match="is no report of a shot"):
         read_earlier(report, path, overwrite=False, skip_existing=True)
-
-
-def test_update_says_that_a_date_lies_in_the_future(tmp_path, bilinear_models, caplog):
-    """Such a frame is fused by every run, and nobody would see why."""
-    folder = make_shot(tmp_path, 2)
-    run(folder, bilinear_models[4])
-    run(folder, bilinear_models[4], update=True)
-    assert "future" not in caplog.text
-    late = folder / "hr/beauty.1002.exr"
-    os.utime(late, (time.time() + CLOCK_SKEW - 20,) * 2)  # another machine's clock
-    run(folder, bilinear_models[4], update=True)
-    assert "future" not in caplog.text
-    os.utime(late, (late.stat().st_mtime + 5000,) * 2)
-    run(folder, bilinear_models[4], update=True)
-    assert f"{late}: is dated in the future, so --update can't tell what is newer" in caplog.text
 
 
 def test_results_do_not_lie_among_the_low_resolution_renders(tmp_path, bilinear_models):

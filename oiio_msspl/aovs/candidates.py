@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from oiio_msspl.aovs.features import RGB, VARIANCE
+from oiio_msspl.aovs.features import NORMAL, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.renderers import (
@@ -55,11 +55,6 @@ class LayerFinder:
                 exactly one layer for the feature.
         """
         entry = entry_of(candidate)
-        layer = str(entry.get("layer", ""))
-        path, layer_in_file = split_exr(layer.removeprefix("file:"))
-        if layer.startswith("file:") and path and not layer_in_file and "times" not in entry:
-            extras = {key: entry[key] for key in ("kind", "encoding", "note") if key in entry}
-            return replace(self._formula_of_file(feature, Path(path)), **extras)
         found = []
         for alias in _aliases(entry):
             if (group := self._group(feature, alias, problems)) is None:
@@ -68,7 +63,9 @@ class LayerFinder:
         groups = [channels for channels, _ in found]
         factor = groups.pop() if "times" in entry else None
         kind = "halves" if "halves" in entry else entry.get("kind", "mean")
-        encoding, note = entry.get("encoding", "signed"), entry.get("note", "")
+        # The table knows how a renderer stores normals, but not how another EXR does.
+        is_exr = feature == NORMAL and bool(split_exr(str(entry.get("layer", "")))[0])
+        encoding, note = entry.get("encoding", "auto" if is_exr else "signed"), entry.get("note", "")
         text = _text([name for _, name in found], factor is not None)
         return FeatureFormula(tuple(groups), factor, kind, encoding, text, note)
 
@@ -89,33 +86,6 @@ class LayerFinder:
             problems.append(wrong_channels(feature, layer))
             return None
         return group, layer.name or " ".join(channel.name for channel in group)
-
-    def _formula_of_file(self, feature: str, path: Path) -> FeatureFormula:
-        """Find the feature of another render by the table of renderers, or else take its only layer."""
-        file = self._open(path)
-        layers = layers_of(file)
-        renderer = detect_renderer(file, layers)
-        own = self._view, self._view_layer
-        words = [(layer.view, layer.name.split(".")) for layer in layers]
-        others = {(view, ".".join(name[:count])) for view, name in words for count in range(len(name))} - {own}
-        # This render's own view and view layer count more than the others.
-        places = ([own], sorted(others))
-        formulas: dict[tuple[Channel, ...], FeatureFormula] = {}
-        for candidate, views in itertools.product(candidates_of(renderer, feature), places):
-            for view, view_layer in views if not formulas else ():
-                if formula := LayerFinder(file, layers, renderer, view, view_layer).formula(feature, candidate, []):
-                    formulas.setdefault(tuple(formula.channels), formula)
-        self._file.siblings.update(file.siblings)
-        if not formulas:
-            layer = _only_layer(path, layers, feature, renderer)
-            group = layer.triple() or layer.scalar()
-            assert group is not None
-            return FeatureFormula((group,), text=path.name)
-        if len(formulas) > 1:
-            texts = [formula.text for formula in formulas.values()]
-            raise InputError(_name_a_layer(path, feature, f"has {len(texts)} layers for it: {', '.join(texts)}", texts))
-        (formula,) = formulas.values()
-        return replace(formula, text=f"{path.name}: {formula.text}")
 
     def _layer(self, feature: str, alias: str) -> Layer | None:
         """Return the layer that an alias names: of the chosen view layer, or else of none."""
@@ -191,8 +161,8 @@ def _only_layer(path: Path, layers: list[Layer], feature: str, renderer: dict[st
     if len(fitting) == 1 and all(view_layer_of(fitting[0].name, beauty) is None for beauty in beauties):
         return fitting[0]
     texts = [layer.name or "R G B" for layer in fitting]
-    candidates = f"among {', '.join(texts)}" if texts else "in it"
-    raise InputError(_name_a_layer(path, feature, f"no layer {candidates} is known as {feature}", texts))
+    there = ", ".join(texts) or "no layer of three channels"
+    raise InputError(_name_a_layer(path, feature, f"holds {there}, and not the {feature} alone", texts))
 
 
 def _name_a_layer(path: Path, feature: str, problem: str, layers: Sequence[str]) -> str:

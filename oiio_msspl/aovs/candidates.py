@@ -62,12 +62,11 @@ class LayerFinder:
             found.append(group)
         groups = [channels for channels, _ in found]
         factor = groups.pop() if "times" in entry else None
-        kind = "halves" if "halves" in entry else entry.get("kind", "mean")
         # The table knows how a renderer stores normals, but not how another EXR does.
         is_exr = feature == NORMAL and bool(split_exr(str(entry.get("layer", "")))[0])
         encoding, note = entry.get("encoding", "auto" if is_exr else "signed"), entry.get("note", "")
         text = _text([name for _, name in found], factor is not None)
-        return FeatureFormula(tuple(groups), factor, kind, encoding, text, note)
+        return FeatureFormula(tuple(groups), factor, encoding, text, note)
 
     def _group(
         self, feature: str, alias: str | list[str], problems: list[str]
@@ -150,7 +149,7 @@ class LayerFinder:
 
 def _aliases(entry: Mapping[str, Any]) -> list[str | list[str]]:
     """Return the layers of a candidate, the factor last; ``channels`` are a list of names."""
-    names = [entry["channels"]] if "channels" in entry else entry.get("sum") or entry.get("halves") or [entry["layer"]]
+    names = [entry["channels"]] if "channels" in entry else entry.get("sum") or [entry["layer"]]
     return [*names, entry["times"]] if "times" in entry else [*names]
 
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute a feature from the channels of a file.
 
-Composites follow the paper's equations, variances become the variance of the pixel's mean luminance, and normals become
-signed vectors.
+Composites follow the paper's equations, variances become the variance of luminance, and normals become signed vectors.
 """
 
 from __future__ import annotations
@@ -17,9 +16,6 @@ from oiio_msspl.exr.reader import Channel
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import luminance
 
-#: Kinds of variance that can be used only if the samples per pixel are known.
-NEEDS_SPP = ("per_sample", "relative", "second_moment")
-
 #: Gives the pixels of some channels, (height, width, len(channels)).
 Take = Callable[[Sequence[Channel]], Array]
 
@@ -31,8 +27,6 @@ class FeatureFormula:
     terms: tuple[tuple[Channel, ...], ...]
     """Groups of channels, three each, or one each for a variance in luminance."""
     factor: tuple[Channel, ...] | None = None
-    kind: str = "mean"
-    """Of a variance: one of ``VARIANCE_KINDS`` in :mod:`oiio_msspl.aovs.mapping`, or ``halves``."""
     encoding: str = "signed"
     """Of a normal: ``signed`` or ``unsigned`` (n * 0.5 + 0.5)."""
     text: str = ""
@@ -48,7 +42,7 @@ class FeatureFormula:
     @property
     def is_computed(self) -> bool:
         """Whether the feature is computed, rather than read from a layer that holds just this."""
-        return len(self.terms) > 1 or self.factor is not None or self.kind != "mean"
+        return len(self.terms) > 1 or self.factor is not None
 
     def evaluate(self, take: Take) -> Array:
         """Return the feature, unless it is a variance: float32 (height, width, 3), in the units of the features."""
@@ -61,28 +55,13 @@ class FeatureFormula:
         normal[~value.any(axis=-1)] = 0  # renderers store an empty background as 0, which no normal is
         return normal
 
-    def evaluate_variance(self, take: Take, mean: Array, spp: float | None) -> Array:
+    def evaluate_variance(self, take: Take) -> Array:
         """Return the variance of the pixel's mean luminance, (height, width, 1).
 
         A variance of colours is turned into one of luminance as if the noise of R, G and B were fully correlated:
         sigma_Y = sum of w_c sigma_c. Monte Carlo noise nearly is, because one path carries all three.
-
-        ``mean`` is the pixel's colour, (height, width, 3). The kinds in ``NEEDS_SPP`` need the samples per pixel.
         """
-        if self.kind == "halves":
-            # The mean of two independent halves a and b of the samples has the variance (a - b)^2 / 4.
-            first, second = (take(term) for term in self.terms)
-            return np.square(luminance((first - second) / np.float32(2)))[..., None]
         value = take(self.terms[0])
-        if self.kind in NEEDS_SPP:
-            assert spp is not None  # map_render drops such a variance otherwise
-            if self.kind == "second_moment":
-                value = value - np.square(mean)
-            elif self.kind == "relative":
-                value = value * (mean if value.shape[-1] == 3 else luminance(mean)[..., None])
-            value = value / spp
-        elif self.kind == "deviation":
-            value = np.square(value)
         if value.shape[-1] == 1:
             return value
         return np.square(luminance(np.sqrt(np.maximum(value, 0))))[..., None]

@@ -125,9 +125,8 @@ class MappedRender:
         available = self.formulas
         names = (*FEATURES, "alpha") if features is None else features
         formulas = {name: available[name] for name in names if name in available}
-        beauty = self.features[RGB].terms[0] if VARIANCE in formulas else ()
         needed = [c for formula in formulas.values() for c in formula.channels]
-        channels = list(dict.fromkeys([*needed, *beauty, *more]))
+        channels = list(dict.fromkeys([*needed, *more]))
         pixels = self.file.read(channels, window)
         place = {channel: i for i, channel in enumerate(channels)}
 
@@ -137,10 +136,7 @@ class MappedRender:
         result: dict[str, Array] = {}
         with np.errstate(all="ignore"):  # the caller repairs and counts NaN and infinities
             for name, formula in formulas.items():
-                if name == VARIANCE:
-                    result[name] = formula.evaluate_variance(take, take(beauty), self.spp)
-                else:
-                    result[name] = formula.evaluate(take)
+                result[name] = formula.evaluate_variance(take) if name == VARIANCE else formula.evaluate(take)
         return result, take(more) if more else pixels[..., :0]
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:

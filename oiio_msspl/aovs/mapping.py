@@ -15,17 +15,15 @@ from typing import Any
 from oiio_msspl.aovs.features import FEATURES, NORMAL, RGB, VARIANCE
 from oiio_msspl.errors import InputError
 
-#: Kinds of variance layers, which ``renderers.toml`` explains.
-VARIANCE_KINDS = ("mean", "per_sample", "relative", "second_moment", "deviation")
 #: Encodings of normal layers; ``auto`` decides by the pixels.
 NORMAL_ENCODINGS = ("signed", "unsigned", "auto")
 
 #: Bytes of the largest file that is read as a mapping.
 LARGEST_MAP_FILE = 1 << 20
 #: Keys that say which layers a candidate reads, and whether their value is a list of names. A candidate has one.
-_FORMS = {"layer": False, "sum": True, "halves": True, "channels": True}
+_FORMS = {"layer": False, "sum": True, "channels": True}
 #: Further keys of a candidate.
-_EXTRAS = {"times", "kind", "encoding", "note"}
+_EXTRAS = {"times", "encoding", "note"}
 
 
 def read_map_file(path: str | Path) -> dict[str, Any]:
@@ -145,17 +143,13 @@ def _problem_of_feature(feature: str, candidate: dict[str, Any]) -> str | None:
     """Check whether a feature can be read from a candidate of valid form."""
     form = next(key for key in candidate if key in _FORMS)
     count = len(candidate[form])
-    kind, encoding = candidate.get("kind"), candidate.get("encoding")
+    encoding = candidate.get("encoding")
     if feature == RGB and (form != "layer" or "times" in candidate):
         return "the result replaces the beauty, so it must be a single layer"
     if feature == VARIANCE and (form == "sum" or "times" in candidate):
-        return "variances don't add up layer by layer; give one layer, or two halves"
-    if form == "halves" and (feature != VARIANCE or count != 2):
-        return "halves are the two half buffers of a variance"
+        return "variances don't add up layer by layer; give one layer"
     if form == "channels" and count not in ((1, 3) if feature == VARIANCE else (3,)):
         return f"has {count} channels, not 3"
-    if "kind" in candidate and (feature != VARIANCE or kind not in VARIANCE_KINDS):
-        return f"kind {kind!r}: only a variance has a kind, one of {', '.join(VARIANCE_KINDS)}"
     if "encoding" in candidate and (feature != NORMAL or encoding not in NORMAL_ENCODINGS):
         return f"encoding {encoding!r}: only a normal has an encoding, one of {', '.join(NORMAL_ENCODINGS)}"
     return None

@@ -15,8 +15,8 @@ import numpy as np
 
 from oiio_msspl.aovs.additive_sets import find_additive_sets
 from oiio_msspl.aovs.candidates import LayerFinder, missing, wrong_channels
-from oiio_msspl.aovs.features import NORMAL, OPTIONAL_FEATURES, RGB, VARIANCE
-from oiio_msspl.aovs.formula import NEEDS_SPP, FeatureFormula
+from oiio_msspl.aovs.features import NORMAL, OPTIONAL_FEATURES, RGB
+from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import check_mapping
 from oiio_msspl.aovs.motion import find_motion_layers
@@ -107,7 +107,6 @@ def map_render(
         notes=list(dict.fromkeys(notes)),
         mapped=frozenset(mapping),
     )
-    _drop_unusable_variance(render)
     _decide_normal_encoding(render)
     render.notes += _small_windows(render)
     return render
@@ -177,18 +176,6 @@ def _check_no_integers(formulas: dict[str, FeatureFormula]) -> None:
                 f"{path}: {feature}: {names} hold integers (ids, not light); "
                 f"choose another layer with --map {feature}=LAYER"
             )
-
-
-def _drop_unusable_variance(render: MappedRender) -> None:
-    """Drop a variance that needs samples per pixel if they are unknown."""
-    formula = render.features.get(VARIANCE)
-    if formula is not None and formula.kind in NEEDS_SPP and not render.spp:
-        del render.features[VARIANCE]
-        text = (
-            f"variance: '{formula.text}' is {formula.kind.replace('_', ' ')}, which needs the samples per pixel; "
-            "the header does not say, so it is not used (--hr-spp says them)"
-        )
-        render.notes.append(text)
 
 
 def _decide_normal_encoding(render: MappedRender) -> None:

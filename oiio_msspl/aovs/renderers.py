@@ -67,7 +67,7 @@ def _names_in(entry: object) -> Iterator[str]:
     if isinstance(entry, str):
         yield entry
     elif isinstance(entry, Mapping | list):
-        keys = ("layer", "layers", "sum", "times", "halves")
+        keys = ("layer", "layers", "sum", "times")
         for element in [entry.get(key, []) for key in keys] if isinstance(entry, Mapping) else entry:
             yield from _names_in(element)
 

@@ -13,11 +13,9 @@ from oiio_msspl.errors import InputError
     [
         ("albedo = 5", "5 is neither a layer's name nor a table"),
         ('albedo = ["a", "b"]', "is neither a layer's name nor a table"),
-        ('variance = { halves = ["a"] }', "the two half buffers"),
         ('albedo = { channels = ["a.R", "a.G"] }', "has 2 channels, not 3"),
         ('albedo = { channels = "R" }', "channels must be a list of names"),
         ('normal = { layer = "n", encoding = "foo" }', "encoding 'foo': only a normal has an encoding, one of signed"),
-        ('albedo = { layer = "a", kind = "mean" }', "kind 'mean': only a variance has a kind"),
         ('albedo = { lay = "a" }', "has lay; give one of layer, sum"),
         ('rgb = { sum = ["a", "b"] }', "must be a single layer"),
         ("albedo =", "can't be read as a mapping"),

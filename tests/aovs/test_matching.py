@@ -170,13 +170,6 @@ def test_a_header_without_a_number_of_samples_says_nothing(tmp_path, samples):
     assert (render.renderer, render.spp) == ("Cycles", None)
 
 
-def test_a_variance_per_sample_without_spp_is_defaulted_and_said(tmp_path):
-    channels = layer("", 1) | layer("Albedo", 2) | layer("Ns", 0, "XYZ") | layer("Variance", 3)
-    render = mapped(tmp_path, channels)
-    assert "variance" not in sources(render)
-    assert "needs the samples per pixel" in render.notes[0]
-
-
 def test_encoded_normals_are_recognised_by_their_pixels(tmp_path):
     """n * 0.5 + 0.5 comes back as n; signed normals are left alone."""
     rng = np.random.default_rng(0)
@@ -315,7 +308,7 @@ def test_listed_channels_are_those_of_the_view(tmp_path):
 @pytest.mark.parametrize(
     ("feature", "candidate", "text"),
     [
-        ("variance", {"layer": "v", "kind": "deviation", "note": "of the mean"}, "v"),
+        ("variance", {"layer": "v", "note": "of the mean"}, "v"),
         ("diffuse", {"sum": ["a", "b"], "times": "c"}, r"\(a \+ b\) \* c"),
         ("normal", {"channels": ["n.u", "n.v", "n.w"], "encoding": "auto"}, "n.u n.v n.w"),
     ],

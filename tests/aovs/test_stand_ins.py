@@ -84,10 +84,6 @@ def expected(feature, source, layers, render):
     if feature == NORMAL:
         return result * 2 - 1 if render.get("normals") == "unsigned" else result
     if feature == VARIANCE:
-        if entry["kind"] == "second_moment":
-            result = result - layers[render["features"][RGB] or "R"][..., :3].astype(np.float32) ** 2
-        if entry["kind"] != "mean":
-            result = result / (render.get("spp") or render["spp_option"])
         return result if result.shape[-1] == 1 else luminance(np.sqrt(result))[..., None] ** 2
     return result * values[entry["times"]] if "times" in entry else result
 
@@ -99,19 +95,18 @@ def test_a_render_with_the_names_of_a_real_one_is_mapped_and_fused(tmp_path, ren
     beauty = render["features"][RGB] or "R"
     low[beauty][..., :3] *= 1.1  # differs from the mean of the HRLS, so the result is not simply the HRLS
     paths = [write(render, tmp_path / name, layers) for name, layers in (("lr", low), ("hr", high))]
-    view, spp = render.get("view"), render.get("spp_option")
-    mapped = map_render(open_exr(paths[1]), view=view, spp=spp)
-    assert (mapped.renderer, mapped.spp) == (render["renderer"], render.get("spp", spp))
+    view = render.get("view")
+    mapped = map_render(open_exr(paths[1]), view=view)
+    assert (mapped.renderer, mapped.spp) == (render["renderer"], render.get("spp"))
     assert mapped.features.keys() == render["features"].keys()
     features = mapped.read(mapped.data_window)
     for name, source in render["features"].items():
         np.testing.assert_allclose(features[name], expected(name, source, high, render), rtol=2e-3, atol=2e-3)
 
-    report = fuse_files(
-        *paths, tmp_path / "out.exr", inputs=InputOptions(view=view, hr_spp=spp), model=str(bilinear_models[SCALE])
-    )
+    inputs = InputOptions(view=view)
+    report = fuse_files(*paths, tmp_path / "out.exr", inputs=inputs, model=str(bilinear_models[SCALE]))
     assert (report.scale, report.repaired, report.negative) == (SCALE, {}, {})
-    written = map_render(open_exr(tmp_path / "out.exr"), view=view, spp=spp)
+    written = map_render(open_exr(tmp_path / "out.exr"), view=view)
     fused = written.read(written.data_window)
     # The model enlarges the LRHS, so the corners of the result are those of the LRHS.
     for y, x in itertools.product((0, -1), repeat=2):

@@ -68,14 +68,6 @@ def test_inspect_names_layers_that_may_hold_vectors(files):
     assert "motion: motion.XY may hold vectors" in run("msspl", "inspect", files / "moving.exr").stdout
 
 
-def test_inspect_keeps_notes_on_a_variance_for_the_model_that_reads_it(files):
-    """A variance of single samples needs the samples per pixel, which this header lacks."""
-    (files / "map.toml").write_text('variance = { layer = "v", kind = "per_sample" }')
-    write_exr(files / "v.exr", rgb(picture(8, 8)) | rgb(picture(8, 8), "v."))
-    command = ["msspl", "inspect", files / "v.exr", "--map-file", files / "map.toml", "--model", "paper"]
-    assert "note: variance: 'v' is per sample, which needs the samples per pixel" in run(*command).stdout
-
-
 def test_inspect_counts_negatives_apart(files):
     values = picture(8, 8)
     values[0, :3, 0], values[1, 0, 1], values[1, 1, 1] = -0.01, np.nan, -np.inf

@@ -6,14 +6,7 @@ from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL
 from oiio_msspl.image.arrays import repair
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.model import encoding
-from oiio_msspl.model.encoding import (
-    MAX_ENCODED,
-    MAX_RADIANCE,
-    NOISY,
-    decode_radiance,
-    encode_radiance,
-    find_exposure,
-)
+from oiio_msspl.model.encoding import MAX_ENCODED, MAX_RADIANCE, NOISY, decode_radiance, encode_radiance, find_exposure
 from tests.conftest import noisy, picture
 
 

@@ -24,14 +24,7 @@ from check_button import (
 )
 from check_motion import render_motion
 from check_passes import check_passes
-from check_renders import (
-    check_choices,
-    check_compositing,
-    check_layers,
-    check_loaded_once,
-    check_renders,
-    check_seed,
-)
+from check_renders import check_choices, check_compositing, check_layers, check_loaded_once, check_renders, check_seed
 from check_scene import check_animated, check_changes, check_samples, check_sentences, render_ramps
 from support import MODULE, WORK, build_scene
 

@@ -130,10 +130,7 @@ def loaded_once(scene: Scene) -> Iterator[None]:
     Data of earlier renders are discarded first: Cycles does not notice that the user has put lights into another group
     since, and renders that group black.
     """
-    with (
-        override(scene, {"render.use_persistent_data": False}),
-        override(scene, {"render.use_persistent_data": True}),
-    ):
+    with override(scene, {"render.use_persistent_data": False}), override(scene, {"render.use_persistent_data": True}):
         yield
 
 

@@ -24,10 +24,7 @@ from tests.shots import HEIGHT, WIDTH, layers, make_shot
         (["lr", "hr", "-o", "no/out"], "no/out: the folder no does not exist"),
         (["lr", "hr", "-o", "text.onnx/out"], "text.onnx: is a file, and the results of a shot need a folder"),
         (["lr", "hr", "-o", "text.onnx"], "text.onnx: is a file, and the results of a shot need a folder"),
-        (
-            ["lr", "hr", "-o", "out", "--temporal", "9"],
-            "give auto, off, or a number of frames from 1 to 8",
-        ),
+        (["lr", "hr", "-o", "out", "--temporal", "9"], "give auto, off, or a number of frames from 1 to 8"),
         (
             ["lr", "hr", "-o", "out", "--temporal", "2"],
             "--temporal 2: hr/beauty.####.exr has no two frames that follow",

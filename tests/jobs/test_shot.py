@@ -651,14 +651,7 @@ def test_a_report_replaces_nothing_but_a_report(tmp_path, bilinear_models, monke
     before = everything(folder)
     inputs = InputOptions({"albedo": f"file:{folder / 'albedo.exr'}"})
     with pytest.raises(InputError, match=message):
-        run(
-            folder,
-            bilinear_models[4],
-            inputs=inputs,
-            previews=True,
-            overwrite=True,
-            report_path=folder / report,
-        )
+        run(folder, bilinear_models[4], inputs=inputs, previews=True, overwrite=True, report_path=folder / report)
     assert everything(folder) == before
 
 

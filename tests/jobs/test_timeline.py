@@ -92,13 +92,7 @@ def test_the_view_with_the_most_neighbours_decides_when_a_frame_is_read_and_sett
             fused.append((number, key))
             timeline.fused(key)
         assert list(timeline.settled()) == ([2] if number == 4 else [])
-    assert fused == [
-        (2, (1, "right")),
-        (2, (2, None)),
-        (3, (2, "left")),
-        (3, (2, "right")),
-        (4, (3, "right")),
-    ]
+    assert fused == [(2, (1, "right")), (2, (2, None)), (3, (2, "left")), (3, (2, "right")), (4, (3, "right"))]
 
 
 def test_without_neighbours_the_order_is_the_one_asked_for():

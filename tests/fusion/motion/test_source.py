@@ -169,11 +169,7 @@ def test_premultiplied_vectors_are_divided_by_alpha(tmp_path, name):
     alpha = np.linspace(0, 1, WIDTH, dtype=np.float32) * np.ones((HEIGHT, 1), np.float32)
     form = MotionFormat(unit="screen", y="up")
     frames = [
-        frame(
-            tmp_path,
-            t,
-            layer(name, encode(vectors(truck_and_dolly, t, 1), form) * alpha[..., None]) | {"A": alpha},
-        )
+        frame(tmp_path, t, layer(name, encode(vectors(truck_and_dolly, t, 1), form) * alpha[..., None]) | {"A": alpha})
         for t in (0, 1)
     ]
     source = find_motion(*frames)

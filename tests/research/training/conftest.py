@@ -18,10 +18,7 @@ def sample_folder(tmp_path: Path) -> Path:
 
 
 def write_wall(
-    folder: Path,
-    ref: np.ndarray | None = None,
-    ref_layers: dict[str, np.ndarray] | None = None,
-    split: str = "train",
+    folder: Path, ref: np.ndarray | None = None, ref_layers: dict[str, np.ndarray] | None = None, split: str = "train"
 ) -> Path:
     """The view of :func:`sample_folder`, with another reference."""
     rng = np.random.default_rng(0)

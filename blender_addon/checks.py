@@ -13,11 +13,7 @@ from .overrides import read
 
 
 def check_scene(scene: Scene, options: Options) -> None:
-    """Check the scene before anything is rendered.
-
-    Raises:
-        Failure: the scene cannot be rendered at these sizes, or its renders could not be fused.
-    """
+    """Check the scene before anything is rendered."""
     render = scene.render
     if render.engine != "CYCLES":
         raise Failure(f"scene '{scene.name}' renders with {render.engine}; set the render engine to Cycles")
@@ -40,9 +36,6 @@ def check_animation(scene: Scene, values: dict[str, Any]) -> None:
 
     Args:
         values: the ``{data path: value}`` that :func:`.overrides.override` has just set.
-
-    Raises:
-        Failure: a setting has another value after the scene is evaluated.
     """
     if scene.animation_data is None:
         return
@@ -59,11 +52,7 @@ def check_animation(scene: Scene, values: dict[str, Any]) -> None:
 
 
 def check_output(path: Path, overwrite: bool) -> None:
-    """Check the output before anything is rendered.
-
-    Raises:
-        Failure: the frame cannot be written there.
-    """
+    """Check the output before anything is rendered."""
     if path.suffix.lower() != ".exr":
         raise Failure(f"{path}: the result is an EXR; name it .exr")
     if not path.parent.is_dir():

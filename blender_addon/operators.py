@@ -182,11 +182,7 @@ _LAST_NUMBER = re.compile(r"(?<![\d#])#+[^/\\\d#]*$")
 
 
 def _output(scene: Scene, view_layer: str) -> str:
-    """Return the name of the output, with the names of the scene in the place of ``{scene_name}`` and so on.
-
-    Raises:
-        Failure: the name holds other braces, or would be that of several view layers.
-    """
+    """Return the name of the output, with the names of the scene in the place of ``{scene_name}`` and so on."""
     pattern, several = scene.msspl.output, [layer.name for layer in scene.view_layers if layer.use]
     if len(several) > 1 and "{view_layer}" not in pattern:
         raise Failure(

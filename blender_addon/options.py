@@ -59,11 +59,7 @@ def lrhs_size(scene: Scene, scale: int) -> tuple[int, int]:
 
 
 def find_view_layer(scene: Scene, options: Options) -> ViewLayer:
-    """Return the view layer to render.
-
-    Raises:
-        Failure: the named view layer does not exist, or none is named and not exactly one is enabled.
-    """
+    """Return the view layer to render: the named one, or the only one that is enabled."""
     names = [options.view_layer] if options.view_layer else [layer.name for layer in scene.view_layers if layer.use]
     if len(names) != 1:
         seen = f"{len(names)} view layers are on ({', '.join(names)})" if names else "no view layer is on"

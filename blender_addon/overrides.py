@@ -47,11 +47,7 @@ def override_after_save(*arguments: object) -> None:
 
 
 def find_scene(name: str, uid: int) -> Scene:
-    """Return the scene with a ``session_uid``. Undo replaces scene objects, so a reference to one becomes invalid.
-
-    Raises:
-        Failure: the scene was removed.
-    """
+    """Return the scene with a ``session_uid``. Undo replaces scene objects, so a reference to one becomes invalid."""
     scene = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
     if scene is None:
         raise Failure(f"scene '{name}' was removed while it was rendered; undo the removal and render again")

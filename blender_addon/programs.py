@@ -28,11 +28,7 @@ _GRACE = 20
 
 
 def find_fuse(preference: str = "") -> str:
-    """Find msspl-fuse: in the add-on's preferences, otherwise in ``MSSPL_FUSE``, otherwise on ``PATH``.
-
-    Raises:
-        Failure: no program is found there.
-    """
+    """Find msspl-fuse: in the add-on's preferences, otherwise in ``MSSPL_FUSE``, otherwise on ``PATH``."""
     variable = os.environ.get("MSSPL_FUSE")
     for where, name in (("the add-on's preferences", preference), ("MSSPL_FUSE", variable), ("", "msspl-fuse")):
         program = shutil.which(os.path.expanduser(name)) if name else None
@@ -44,11 +40,7 @@ def find_fuse(preference: str = "") -> str:
 
 
 def find_render(preference: str = "") -> str:
-    """Find msspl-render, which is installed beside msspl-fuse.
-
-    Raises:
-        Failure: one of the two is not found.
-    """
+    """Find msspl-render, which is installed beside msspl-fuse."""
     fuse = Path(find_fuse(preference))
     program = shutil.which(str(fuse.with_name(f"msspl-render{fuse.suffix}")))
     if program is None:

@@ -102,11 +102,7 @@ def open_comparison(images: Sequence[Path], reference: Path | None = None, layer
 
 
 def score_images(comparison: Comparison) -> list[dict[str, float]]:
-    """Return the :func:`scores` of all images. Those smaller than the reference are upsampled bicubically first.
-
-    Raises:
-        InputError: pixels can't be read, or the compared part is too small.
-    """
+    """Return the :func:`scores` of all images. Those smaller than the reference are upsampled bicubically first."""
     render, window = comparison.renders[-1], comparison.windows[-1]
     if min(window.height, window.width) < SSIM_WINDOW:
         part = "is" if window == render.data_window else "the part that all files show is"
@@ -186,9 +182,6 @@ def common_windows(renders: Sequence[MappedRender], largest: MappedRender) -> li
     Renders are laid over each other by their display windows if these are equal, or if one is cropped and the sizes of
     their display windows differ by a scale of ``SCALES``. Otherwise a render shows the data window of ``largest``, at
     its size or smaller by such a scale.
-
-    Raises:
-        InputError: a size does not fit, or renders have no part in common.
     """
     whole = common = largest.data_window
     places = [_place(render, largest) for render in renders]

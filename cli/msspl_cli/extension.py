@@ -19,11 +19,7 @@ _MANIFEST = "blender_manifest.toml"
 
 
 def unpack_extension(file: Path) -> Path:
-    """Unpack the extension where :func:`find_extension` looks for it, in the place of an earlier one.
-
-    Raises:
-        InputError: the file is not the extension of this version, or the folder can't be written.
-    """
+    """Unpack the extension where :func:`find_extension` looks for it, in the place of an earlier one."""
     folder = _unpacked()
     try:
         with zipfile.ZipFile(file) as content:
@@ -41,11 +37,7 @@ def unpack_extension(file: Path) -> Path:
 
 
 def find_extension() -> Path:
-    """Return the folder of the extension: that of MSSPL_BLENDER_ADDON, of the source tree, or the unpacked one.
-
-    Raises:
-        InputError: it is not installed, or is that of another version.
-    """
+    """Return the folder of the extension: that of MSSPL_BLENDER_ADDON, of the source tree, or the unpacked one."""
     source = Path(__file__).resolve().parents[2] / "blender_addon"
     named = os.environ.get("MSSPL_BLENDER_ADDON")
     folder = Path(named) if named else source if source.is_dir() else _unpacked()

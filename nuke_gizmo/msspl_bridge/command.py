@@ -100,11 +100,7 @@ def _options(settings: Settings) -> list[str]:
 
 
 def split_words(knob: str, text: str) -> list[str]:
-    """Split the value of a knob as a shell does.
-
-    Raises:
-        FuseError: a quotation has no end.
-    """
+    """Split the value of a knob as a shell does."""
     try:
         return shlex.split(with_slashes(text))  # shlex would remove the backslashes of Windows paths
     except ValueError as error:
@@ -112,11 +108,7 @@ def split_words(knob: str, text: str) -> list[str]:
 
 
 def find_program(chosen: str, environment: Mapping[str, str]) -> str:
-    """Find msspl-fuse: the chosen one, otherwise ``MSSPL_FUSE``, otherwise the first on ``PATH``.
-
-    Raises:
-        FuseError: no program is found there.
-    """
+    """Find msspl-fuse: the chosen one, otherwise ``MSSPL_FUSE``, otherwise the first on ``PATH``."""
     variable = environment.get("MSSPL_FUSE", "")
     for source, name in (("the program knob", chosen), ("MSSPL_FUSE", variable), ("", "msspl-fuse")):
         program = shutil.which(os.path.expanduser(name), path=environment.get("PATH")) if name else None

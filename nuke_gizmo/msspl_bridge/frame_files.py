@@ -59,9 +59,6 @@ def find_number(pattern: str, path: str) -> FrameFile:
         pattern: the file knob of the Read, with ``%04d`` or ``####`` for the number. If it has ``%V`` or ``%v`` for the
             view, head and tail have it, too.
         path: the file that Nuke found through the pattern.
-
-    Raises:
-        FuseError: the path does not match the pattern.
     """
     pattern, path = with_slashes(pattern), with_slashes(path)
     folder, expected = posixpath.split(pattern)
@@ -79,11 +76,7 @@ def find_number(pattern: str, path: str) -> FrameFile:
 
 
 def parse_range(text: str) -> range:
-    """Return the frames of ``1001-1100``, or of ``1001``.
-
-    Raises:
-        FuseError: the text is something else, or an empty range.
-    """
+    """Return the frames of ``1001-1100``, or of ``1001``."""
     match = re.fullmatch(r"(-?\d+)(?:-(-?\d+))?", text)
     frames = range(int(match[1]), int(match[2] or match[1]) + 1) if match else range(0)
     if not frames:
@@ -98,9 +91,6 @@ def name_output(text: str, hrls: FrameFile, frame: int) -> FrameFile:
         text: the output knob. If it is empty, the output goes beside the HRLS, with ``_fused`` added to the name.
         hrls: the HRLS, whose number becomes the output's number.
         frame: the output's number if the HRLS is a still.
-
-    Raises:
-        FuseError: the path is relative, so every program would take it from another folder.
     """
     if not text:
         if hrls.number is None:
@@ -124,9 +114,6 @@ def file_numbers(inputs: Sequence[ReadRange], out: FrameFile, first: int, last: 
 
     Args:
         first, last: the range in the host's frames.
-
-    Raises:
-        FuseError: an input has no file per frame, the numbers of the inputs differ, or the output has no number.
     """
     for source in inputs:
         begin, end = source.first.number, source.last.number

@@ -30,9 +30,6 @@ def fused_sets(attribute: object, channels: Iterable[str]) -> list[FusedSet]:
     Args:
         attribute: value of :data:`ATTRIBUTE`; None in a file without it.
         channels: of the Read, such as ``ViewLayer_Emit.red``.
-
-    Raises:
-        FuseError: the file has no fused layers, or each set lacks one, because it was left out.
     """
     stored = json.loads(str(attribute or "[]"))
     if not stored:

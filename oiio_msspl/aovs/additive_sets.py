@@ -90,15 +90,8 @@ def find_additive_sets(
 
     The first set of a name counts.
 
-    Args:
-        renderer: entry of the table.
-        layers: of the file, in which the view and view layer of ``beauty`` are searched.
-        beauty: the one that the sets should sum to.
-        sums: the user's, as ``NAME=a+b+c*d``.
-        file: the file, whose header may name layers; None for layers without a file.
-
-    Raises:
-        InputError: a sum of the user can't be read, names a layer that is not there, or has the name of another.
+    They are searched in the view and view layer of ``beauty``, which they should sum to. The header of ``file`` may
+    name layers.
     """
     finder = _Finder(layers, beauty, partial(names_of_aov, renderer, file) if file else lambda alias: [alias])
     sets = [_user_set(finder, text, str(file.path) if file else "") for text in sums]

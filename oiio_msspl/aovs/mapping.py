@@ -30,9 +30,6 @@ def read_map_file(path: str | Path) -> dict[str, Any]:
     """Read a user's mapping, candidates by feature: a TOML file with lines ``feature = candidate``.
 
     Its EXR files (``file:masks/albedo.exr``) are relative to the folder of the TOML file; the result has full paths.
-
-    Raises:
-        InputError: the file can't be read, or an entry is not a candidate.
     """
     path = Path(path)
     try:
@@ -54,9 +51,6 @@ def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
 
     ``layer`` may be a sum (``lighting+GI``), an EXR (``a.exr``) or a layer of it (``a.exr:albedo``). Paths become full
     paths, because a farm's worker reads them in another folder.
-
-    Raises:
-        InputError: ``=`` is missing, the feature is unknown, or it can't be read in this form.
     """
     mapping: dict[str, Any] = {}
     for option in options:

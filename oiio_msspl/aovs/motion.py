@@ -124,11 +124,7 @@ def find_motion_layers(
 ) -> MotionLayers:
     """Find the layers of motion vectors and position in the view and view layer of a beauty.
 
-    Args:
-        renderer: entry of the table, whose names are tried before those that are common to all renderers.
-        layers: of the file.
-        beauty: the one that was chosen.
-        read: channels that hold something else.
+    The names of the renderer are tried before those that are common to all. The channels ``read`` hold something else.
     """
     named = {name: layer for name, layer in beauty.layers_of_view(layers) if name}
     common = renderers()[-1]
@@ -164,9 +160,6 @@ def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionF
         text: ``layer=NAME`` and any of ``channels=XY``, ``to=``, ``x=``, ``y=``, ``unit=``, ``scale=``, ``offset=`` and
             ``premultiplied``, separated by commas. Further layers follow behind ``+``. The pixels decide words that are
             left out.
-
-    Raises:
-        InputError: the text can't be read, or the file has no such layer.
     """
     described = []
     for words in read_format(text):
@@ -188,11 +181,7 @@ def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionF
 
 
 def read_format(text: str) -> list[dict[str, Any]]:
-    """Read a ``--motion-format``, see :func:`user_fields`: the words of each layer.
-
-    Raises:
-        InputError: the text can't be read.
-    """
+    """Read a ``--motion-format``, see :func:`user_fields`: the words of each layer."""
     layers: list[dict[str, Any]] = []
     for part in re.split(r"\+(?=layer=)", text.strip()):
         layers.append(words := {})

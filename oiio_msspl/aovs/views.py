@@ -85,11 +85,7 @@ def find_alpha(layers: Iterable[Layer], beauty: Beauty) -> Channel | None:
 
 
 def choose_beauty(file: ExrFile, beauties: list[Beauty], wanted: str | None) -> Beauty:
-    """Return the beauty of the view or view layer that is wanted, or the first one if none is.
-
-    Raises:
-        InputError: the file has no such view or view layer.
-    """
+    """Return the beauty of the view or view layer that is wanted, or the first one if none is."""
     if wanted is None or (len(beauties) == 1 and not beauties[0].label):  # the only view may have no name
         return beauties[0]
     for beauty in sorted(beauties, key=lambda beauty: beauty.label != wanted):  # the whole name counts more than a part

@@ -32,12 +32,7 @@ _ABANDONED = 24 * 3600
 
 
 def check_target(path: str | Path, *, overwrite: bool) -> Path:
-    """Check that a file can be written at ``path``, before any work is done, and return it as a ``Path``.
-
-    Raises:
-        InputError: the file exists and may not be overwritten, is write-protected or a folder, or its folder is
-            missing or read-only.
-    """
+    """Check that a file can be written at ``path``, before any work is done, and return it as a ``Path``."""
     path = Path(path)
     check_encodable(path)
     if path.is_dir():
@@ -57,9 +52,6 @@ def check_separate(reads: Iterable[Path], writes: Iterable[Path]) -> None:
     """Check that a run reads no file that it writes, and writes no file under two names.
 
     Links and hard links are followed. ``--overwrite`` makes no difference: the caller wants both files.
-
-    Raises:
-        InputError: a file that is written is read, or is written twice.
     """
     read = {_identity(path) for path in reads}
     written: dict[object, Path] = {}

@@ -104,11 +104,7 @@ def without_alpha_apart(beauty: Sequence[Channel]) -> tuple[Channel, ...]:
 
 
 def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequence[str]) -> frozenset[Channel]:
-    """Return the channels of the HRLS that are not the beauty, and that no pattern of ``WriteOptions.layers`` matches.
-
-    Raises:
-        InputError: a pattern matches nothing.
-    """
+    """Return the channels of the HRLS that are not the beauty, and that match no pattern of ``WriteOptions.layers``."""
     if not patterns:
         return frozenset()
     # A deep part must not take the place of a flat one that has a layer of the same name.

@@ -30,12 +30,7 @@ _SHARED = ("chromaticities", "timeCode")
 
 
 def write_single_part(path: Path, contents: FileContents) -> None:
-    """Write all channels into one part of the file ``path``.
-
-    Raises:
-        InputError: parts have different data windows or equal channel names, or a layer can't be read.
-        MssplError: the file can't be written.
-    """
+    """Write all channels into one part of the file ``path``."""
     import OpenEXR
 
     channels = _fused_channels(contents) | _passed_on_channels(contents)
@@ -82,11 +77,7 @@ def _passed_on(contents: FileContents) -> Iterator[tuple[Part, list[Channel]]]:
 
 
 def channel_names(contents: FileContents) -> dict[Channel, str]:
-    """Name the channels that are passed on, by the headers alone.
-
-    Raises:
-        InputError: parts have different data windows, or two channels would have one name.
-    """
+    """Name the channels that are passed on, by the headers alone."""
     path, window = contents.source.path, contents.home.data_window
     taken = {channel.name for channel in contents.beauty}
     names: dict[Channel, str] = {}

@@ -102,12 +102,7 @@ def write_fused(
 
 
 def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str]) -> None:
-    """Check by the headers alone that the layout can hold what :func:`write_fused` would write.
-
-    Raises:
-        InputError: it can't; one of the further layers, ``extra``, has the name of a layer of the HRLS; a pattern of
-            ``options`` matches nothing.
-    """
+    """Check by the headers alone that the layout can hold what :func:`write_fused` would write."""
     contents = _without_pixels(source, beauty, options, extra)
     kept = {layer.name for channel, layer in contents.layers.items() if channel not in contents.dropped}
     if name := next((name for name in contents.extra if name in kept), None):

@@ -73,9 +73,6 @@ def reserve(file: IO[bytes], size: int) -> None:
     """Make a temporary file at least ``size`` bytes large, and reserve them on the disk.
 
     Otherwise a full disk would end the process when pixels are written into a file that is mapped into memory.
-
-    Raises:
-        MssplError: the disk has no room.
     """
     try:
         if size and hasattr(os, "posix_fallocate"):  # not on macOS and Windows

@@ -47,9 +47,6 @@ def ssim(image: Array, reference: Array) -> float:
     """Compute the SSIM of the luma of the pictures in sRGB, in [-1, 1].
 
     After Wang et al. 2004: Gaussian window of 11 x 11 pixels with sigma 1.5, K1 = 0.01, K2 = 0.03.
-
-    Raises:
-        ValueError: a side is shorter than the window.
     """
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs at least 11 x 11 pixels, got {image.shape[1]} x {image.shape[0]}")

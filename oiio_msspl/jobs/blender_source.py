@@ -128,9 +128,6 @@ class RenderedShot:
             size: width and height of the frame.
             layers: names of the passes that Cycles will render; None if they are not known.
             pixel_bytes: bytes of all passes for each pixel, at least.
-
-        Raises:
-            InputError: the frame needs more memory than it may take, or a pattern of ``--passes`` matches no pass.
         """
         write = self._settings.write
         (width, height), scale = size, self._scale

@@ -144,13 +144,7 @@ def look_ahead(frames: Sequence[FrameFiles], settings: Settings) -> dict[str, An
 def check_wanted_outputs(
     frames: Sequence[FrameFiles], inputs: InputOptions, write: WriteOptions, model: str | None, max_memory: int
 ) -> None:
-    """Check on the first pair that can be read that the outputs can be written, before a farm is asked for them.
-
-    Raises:
-        InputError: no pair can be read, a layer or a set of passes that an option names does not exist, the layout
-            can't hold the layers, the model is for another scale or does not make a layer, or ``max_memory`` bytes are
-            too few.
-    """
+    """Check on the first pair that can be read that the outputs can be written, before a farm is asked for them."""
     check_mapped_sequences(frames, inputs)
     problem: InputError | None = None
     for frame in frames:

@@ -79,9 +79,6 @@ class ExistingResults:
         """Check that frames that are skipped were fused by the weights that fuse the others now.
 
         An EXR without the digests of its weights passes: another program, or a version before 1.0, has written it.
-
-        Raises:
-            InputError: other weights made a frame.
         """
         model, device = self.settings.model, self.settings.device
         for files in skipped:

@@ -99,10 +99,6 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
     Returns:
         LRHS and HRLS. The LRHS has albedo and normal only if its file does. It is mapped for the view of the HRLS, or
         for its own first view if it lacks that one. One render, whose path is given as both, is both.
-
-    Raises:
-        InputError: one of the files can't be used, two paths are the same file, the LRHS lacks the first view of the
-            HRLS and has another one, or their headers declare two colour spaces.
     """
     lr_path, hr_path = Path(lr_path), Path(hr_path)
     if lr_path == hr_path:

@@ -68,13 +68,7 @@ def budget_view(
 ) -> ViewMemory:
     """Budget the memory of a view.
 
-    Args:
-        lr, hr: the pair, with the light of its passes if renders are averaged with those of neighbours.
-        features: those to read, where the pair has them.
-        plan: of the view.
-        error: whether the expected error is computed.
-        max_memory: what the process should stay below.
-        other_views: see :class:`ViewMemory`.
+    The pair has the light of its passes if renders are averaged with those of neighbours.
     """
     alignment, reach = align(lr, hr), plan.reach
     channels = plan.motion.channels(hr) if plan.motion else []
@@ -107,11 +101,7 @@ def _waiting_means(lr: MappedRender, hr: MappedRender, reach: Reach) -> int:
 def memory_to_average(reach: Reach, window: Window, channels: int, scale: int) -> tuple[int, int]:
     """Return what waits to be averaged, without the pixels of renders that are in memory, and what averaging takes.
 
-    Args:
-        reach: neighbours of a frame.
-        window: the HRLS's data window.
-        channels: of its features.
-        scale: of the pair.
+    ``window`` is the HRLS's data window, and ``channels`` are those of its features.
     """
     if not reach.frames:
         return 0, 0
@@ -141,9 +131,6 @@ def check_frame_memory(
     Args:
         layers: bytes of other layers that writing holds at once, see :func:`oiio_msspl.exr.writer.bytes_held`.
         held: bytes that other frames need.
-
-    Raises:
-        InputError: it does not fit. The message says how much does.
     """
     to_fuse = memory_to_fuse(alignment, session.contract, error=write.error_layer)
     to_write = memory_to_write(alignment, write, layers)

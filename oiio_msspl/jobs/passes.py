@@ -27,10 +27,6 @@ def check_layers(views: Sequence[MappedRender], write: WriteOptions) -> None:
 
     Args:
         views: the HRLS, mapped for each of its views; the first one in front.
-
-    Raises:
-        InputError: a pattern of ``write`` matches nothing, the layout can't hold the layers, no view has additive sets
-            of this name, a sum of the user's is not to be fused, or the first view lacks the data passes.
     """
     hr = views[0]
     added = [name for name, option in ADDED.items() if getattr(write, option)]

@@ -131,12 +131,7 @@ def plan_temporal(
 
     Each view and view layer has its own motion. If that of the first view is not known, all are fused frame by frame.
 
-    Args:
-        model: what the user has chosen, see :func:`oiio_msspl.model.catalogue.find_model`.
-        write: views whose beauty is not written are not planned.
-
-    Raises:
-        InputError: the user asks for neighbours, and nothing is known of the motion.
+    Views whose beauty ``write`` leaves out are not planned.
     """
     if options.frames == OFF:
         return ShotPlan()
@@ -219,9 +214,6 @@ def _motion_of(
     The camera may stand still at one end, or move in one direction only, so several pairs of successive frames are
     judged until they tell how vectors are stored. A frame that can't be read is passed over, because the run says so
     when its turn comes.
-
-    Raises:
-        InputError: the user asks for neighbours, and no pair can be judged, or they contradict each other.
     """
 
     def render(number: int) -> MappedRender:

@@ -198,14 +198,7 @@ def format_frames(numbers: Iterable[int]) -> str:
 
 
 def parse_frames(frames: str | Iterable[int]) -> list[int]:
-    """Return frame numbers, each once, in the order given.
-
-    Args:
-        frames: numbers, or a range such as ``1001-1100x2,1200``.
-
-    Raises:
-        InputError: the range can't be read, names no frame, or names fractions of frames.
-    """
+    """Return the numbers of a range such as ``1001-1100x2,1200``, or numbers, each once, in the order given."""
     if isinstance(frames, str):
         if re.search(r"\d\s+\d", frames):
             raise InputError(f"--frames {frames!r}: separate numbers and ranges by commas, such as 1001,1005-1010")
@@ -224,11 +217,7 @@ def parse_frames(frames: str | Iterable[int]) -> list[int]:
 
 
 def parse_pattern(path: Path) -> Pattern:
-    """Read a pattern such as ``lr.####.exr``.
-
-    Raises:
-        InputError: the name has no frame number, or several.
-    """
+    """Read a pattern such as ``lr.####.exr``."""
     fields = _number_fields(path.name)
     if len(fields) != 1:
         raise InputError(f"{path}: a pattern has its frame number in one place, such as name.####.exr or name.%04d.exr")

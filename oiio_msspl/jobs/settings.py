@@ -79,11 +79,7 @@ class Settings:
 
 
 def bytes_of(size: int | str) -> int:
-    """Return the number of bytes that ``3G``, ``800M`` or a number means.
-
-    Raises:
-        InputError: the text can't be read, or no machine has so much memory.
-    """
+    """Return the number of bytes that ``3G``, ``800M`` or a number means."""
     if isinstance(size, int):
         return size
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", size.strip(), re.IGNORECASE)
@@ -109,14 +105,8 @@ def choose_model(
     albedo and a normal, and the default quality replaces it. Then :func:`family_for_noise` decides. Notes of the HRLS
     say so, and if a model that is named does not suit the noise.
 
-    Args:
-        lr, hr: the pair.
-        model: what the user has chosen.
-        read: gives the pair in memory; None to look at small samples of the files.
-        error: the model must predict its error.
-
-    Raises:
-        InputError: the pair does not fit together.
+    ``read`` gives the pair in memory; without it, small samples of the files are looked at. With ``error``, the model
+    must predict its error.
     """
     alignment = align(lr, hr)
 

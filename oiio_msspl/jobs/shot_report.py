@@ -182,10 +182,8 @@ def result_of(frame: FrameFiles, status: str, message: str = "", exit_code: int 
 def fused_result(frame: FrameFiles, frame_report: dict[str, Any], report: ShotReport) -> FrameResult:
     """Return the result of a fused frame, which becomes ``report.first`` if it is the first one.
 
-    Args:
-        frame: the frame.
-        frame_report: its :meth:`oiio_msspl.jobs.report.FrameReport.as_dict`.
-        report: of the shot. A difference to its first fused frame that may flicker gives a warning.
+    A difference to the first fused frame that may flicker gives a warning. ``frame_report`` is that of
+    :meth:`oiio_msspl.jobs.report.FrameReport.as_dict`.
     """
     here = {"frame": frame.number, "neighbours": report.neighbours, **frame_report}
     first = report.first = report.first or here
@@ -256,18 +254,12 @@ def read_earlier(
 ) -> dict[int, dict[str, Any]]:
     """Read the report of the run that ``skip_existing`` resumes, and check that a report can be written.
 
-    Args:
-        report: gets ``first`` and ``others`` from the earlier report.
-        path: the report's file; None for no report.
-        overwrite, skip_existing: whether the file may exist.
+    It gives the shot's report its ``first`` and ``others``. Not even with ``overwrite`` is a render replaced by a
+    report.
 
     Returns:
         What the earlier report says of each frame, without the warnings that it is older than an input, which each run
         finds out anew.
-
-    Raises:
-        InputError: the file exists and may not be replaced, or it is not a report of this shot. Not even with
-            ``--overwrite`` is a render replaced by a report.
     """
     if path is None:
         return {}

@@ -65,9 +65,6 @@ def set_line(path: Path, line: str | None) -> bool:
     """Make ``line`` our only line in a file, at its end. All other bytes stay.
 
     The file need not exist. The line ends with ``MARKER``; None removes it. Return whether the file changed.
-
-    Raises:
-        InputError: the folder is missing, or the file can't be read.
     """
     # Nuke makes ~/.nuke when it starts for the first time. Another folder may be a slip.
     if not path.parent.is_dir() and (path.parent.name != ".nuke" or not path.parent.parent.is_dir()):

@@ -41,17 +41,7 @@ CHUNK = 8
 
 
 def connect(scheduler: str) -> Client:
-    """Connect to a Dask cluster.
-
-    Args:
-        scheduler: address of its scheduler (``tcp://host:8786``), or a scheduler file.
-
-    Returns:
-        A client, which the caller closes.
-
-    Raises:
-        InputError: Dask is not installed, or no scheduler answers.
-    """
+    """Return a client of a Dask cluster, by its scheduler's address (``tcp://host:8786``) or file, which to close."""
     try:
         from dask.distributed import Client
     except ImportError as error:
@@ -76,10 +66,6 @@ def fuse_frames(
 
     Yields:
         A frame as soon as it ends, in any order, with its outcome: None if its EXR already existed.
-
-    Raises:
-        InputError: a worker takes several frames at a time.
-        MssplError: the scheduler is gone.
     """
     from dask.distributed import CancelledError, KilledWorker, as_completed
     from distributed.comm import CommClosedError

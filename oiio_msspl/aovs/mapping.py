@@ -18,8 +18,6 @@ from oiio_msspl.errors import InputError
 #: Encodings of normal layers; ``auto`` decides by the pixels.
 NORMAL_ENCODINGS = ("signed", "unsigned", "auto")
 
-#: Bytes of the largest file that is read as a mapping.
-LARGEST_MAP_FILE = 1 << 20
 #: Keys that say which layers a candidate reads, and whether their value is a list of names. A candidate has one.
 _FORMS = {"layer": False, "sum": True, "channels": True}
 #: Further keys of a candidate.
@@ -36,8 +34,6 @@ def read_map_file(path: str | Path) -> dict[str, Any]:
         if not path.is_file():  # devices such as /dev/zero never end
             problem = "is a folder" if path.is_dir() else "is no ordinary file" if path.exists() else "no such file"
             raise InputError(f"{path}: {problem}; name a TOML file with a line for each feature")
-        if path.stat().st_size > LARGEST_MAP_FILE:
-            raise InputError(f"{path}: is too large for a mapping; name a TOML file with a line for each feature")
         mapping = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:  # text that is not UTF-8, a mistake in the TOML, a number of 5,000 digits
         raise InputError(f"{path}: can't be read as a mapping ({error})") from error

@@ -34,9 +34,6 @@ ALONE = 1.1
 #: The most layers that a warning names.
 MOST_NAMES = 6
 
-#: Bytes of the largest file that is read as an earlier report. A frame takes one or two thousand.
-LARGEST_REPORT = 128 << 20
-
 #: The code of the warning that a result is older than a file that it is made from.
 OLDER = "older"
 
@@ -268,8 +265,6 @@ def read_earlier(
     check_target(path, overwrite=overwrite or skip_existing)
     if not path.exists():
         return {}
-    if path.stat().st_size > LARGEST_REPORT:
-        raise InputError(f"{path}: exists and is too large for a report of a shot; name another file")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         entries = {}

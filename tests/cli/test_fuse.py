@@ -156,8 +156,6 @@ def test_nothing_is_overwritten_without_being_told(files, bilinear_models):
         (["lr.exr", "hr.exr", "--model", "nothing"], "no model 'nothing'"),
         (["lr.exr", "hr.exr", "--layout", "x"], "use one of spec"),
         (["lr.exr", "hr.exr", "--max-memory", "lots"], "write it as 3G or 800M"),
-        (["lr.exr", "hr.exr", "--max-memory", "9" * 400], "--max-memory: the number is too large; write it as 3G"),
-        (["lr.exr", "hr.exr", "--max-memory", "9" * 300 + "G"], "--max-memory: the number is too large"),
         (["lr.exr", "hr.exr", "--max-memory", "1M"], "allow at least"),
         (["lr.exr", "hr.exr", "--lr-spp", "inf"], "--lr-spp inf: give the samples per pixel, a number above 0"),
         (["lr.exr", "hr.exr", "--hr-spp", "nan"], "--hr-spp nan: give the samples per pixel, a number above 0"),

@@ -19,7 +19,7 @@ from oiio_msspl._version import full_version
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.jobs import existing, memory, pipeline, shot, shot_report, write
+from oiio_msspl.jobs import existing, memory, pipeline, shot, write
 from oiio_msspl.jobs import run as run_module
 from oiio_msspl.jobs.plan import TemporalOptions
 from oiio_msspl.jobs.run import ShotRun
@@ -633,18 +633,15 @@ def test_temporary_files_of_two_machines_have_two_names(tmp_path, monkeypatch):
         ("out/beauty.1002.png", "is the same file as"),
         ("link.json", "is one of the inputs"),
         ("somebody.txt", "is no report of a shot"),
-        ("large.json", "is too large for a report of a shot"),
         ("pipe", "is no ordinary file"),
     ],
 )
 @pytest.mark.parametrize("existing", [True, False])
-def test_a_report_replaces_nothing_but_a_report(tmp_path, bilinear_models, monkeypatch, report, message, existing):
+def test_a_report_replaces_nothing_but_a_report(tmp_path, bilinear_models, report, message, existing):
     folder = make_shot(tmp_path, 2)
     write_exr(folder / "albedo.exr", rgb(picture(HEIGHT, WIDTH)))
     (folder / "link.json").symlink_to("hr/beauty.1001.exr")
     (folder / "somebody.txt").write_text("mine")
-    (folder / "large.json").write_text(json.dumps({"frames": [], "first_fused": None}))
-    monkeypatch.setattr(shot_report, "LARGEST_REPORT", 20)
     os.mkfifo(folder / "pipe")  # as /dev/zero, it would be read for ever
     if existing:
         assert run(folder, bilinear_models[4], previews=True).exit_code == 0

@@ -37,12 +37,6 @@ def test_the_main_job(files, bilinear_models):
     assert (preview.spec().width, preview.spec().height, preview.spec().nchannels) == (128, 96, 3)
 
 
-def test_the_example_is_fused_with_its_passes_and_without_a_warning(tmp_path):
-    done = fuse(EXAMPLES / "lr.exr", EXAMPLES / "hr.exr", "-o", tmp_path / "out.exr")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "components: fused" in done.stdout
-
-
 def test_with_strict_a_warning_is_an_error(files, bilinear_models):
     """A good pair is written; one with a warning is not."""
     options = ("--model", bilinear_models[4], "--no-preview", "--strict")
@@ -102,20 +96,8 @@ def test_what_the_renders_bring_back_can_be_seen_and_left_out(files):
 
 
 def test_the_report_for_machines(files, bilinear_models):
-    done = fuse(
-        files / "lr.exr",
-        files / "hr.exr",
-        "-o",
-        files / "out.exr",
-        "--model",
-        bilinear_models[4],
-        "--json",
-        "--lr-spp",
-        16,
-        "--hr-spp",
-        1,
-        "--no-preview",
-    )
+    options = "--json", "--lr-spp", 16, "--hr-spp", 1, "--no-preview", "--model", bilinear_models[4]
+    done = fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", *options)
     report = json.loads(done.stdout)
     assert report["spp"] == {"lrhs": 16, "hrls": 1, "average": 2}
     assert report["preview"] is None
@@ -213,18 +195,10 @@ def test_wrong_usage_is_exit_code_2(files):
 
 
 def test_opencolorio_views_of_the_preview(files, bilinear_models):
-    arguments = [
-        files / "lr.exr",
-        files / "hr.exr",
-        "-o",
-        files / "out.exr",
-        "--model",
-        bilinear_models[4],
-        "--overwrite",
-    ]
+    arguments = [files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4]]
     pictures = []
     for extra in ([], ["--ocio-view", "Un-tone-mapped"], ["--ocio-view", "ACES 1.0 - SDR Video"]):
-        assert fuse(*arguments, *extra).returncode == 0
+        assert fuse(*arguments, "--overwrite", *extra).returncode == 0
         pictures.append(np.asarray(oiio.ImageBuf(str(files / "out.png")).get_pixels(oiio.UINT8)).astype(int))
     assert np.abs(pictures[0] - pictures[1]).max() <= 2  # the paper's curve is sRGB, clipped at white
     assert np.abs(pictures[0] - pictures[2]).mean() > 5
@@ -260,10 +234,9 @@ def test_all_views_that_are_fused_are_named(tmp_path, bilinear_models):
     assert "views left/bg, right/bg, left/fg, right/fg\n" in done.stdout, done.stderr
 
 
-@pytest.mark.parametrize("pattern", ["crypto*", "CRYPTO*", "viewlayer.crypto*", "*Crypto*"])
-def test_layers_of_the_example_are_chosen_by_any_spelling(tmp_path, bilinear_models, pattern):
+def test_layers_of_the_example_are_chosen_by_any_spelling(tmp_path, bilinear_models):
     """The example's layers are called ViewLayer.CryptoObject00 and so on."""
-    options = ("--model", bilinear_models[4], "--no-preview", "--layers", pattern)
+    options = ("--model", bilinear_models[4], "--no-preview", "--layers", "viewlayer.CRYPTO*")
     done = fuse(EXAMPLES / "lr.exr", EXAMPLES / "hr.exr", "-o", tmp_path / "out.exr", *options)
     assert done.returncode == 0, done.stderr
     names = {channel.name.split(".")[1] for part in open_exr(tmp_path / "out.exr").parts for channel in part.channels}
@@ -273,7 +246,7 @@ def test_layers_of_the_example_are_chosen_by_any_spelling(tmp_path, bilinear_mod
 def test_the_readmes_first_command_shows_a_result(tmp_path):
     """Our own example pair through the shipped model: finite, as bright as the LRHS, cryptomatte still there."""
     done = fuse(EXAMPLES / "lr.exr", EXAMPLES / "hr.exr", "-o", tmp_path / "out.exr", "--json")
-    assert done.returncode == 0, done.stderr
+    assert (done.returncode, done.stderr) == (0, "")
     report = json.loads(done.stdout)
     assert (report["scale"], report["spp"]["average"]) == (4, 2)
     out = map_render(open_exr(tmp_path / "out.exr"))
@@ -366,13 +339,6 @@ run(app)
     process.communicate(timeout=30)
     assert process.returncode == (130 if names[0] == "SIGINT" else 128 + getattr(signal, names[0]))
     assert [path.name for path in files.iterdir() if path.name.startswith((".", "new"))] == ["new.cleaned"]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
-def test_nohup_is_respected(files):
-    code = "import os, signal; from msspl_cli.errors import _exit_on_signals as on\n"
-    code += "signal.signal(signal.SIGHUP, signal.SIG_IGN); on(); os.kill(os.getpid(), signal.SIGHUP); print('lives')"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "lives\n"
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,11 @@ def doubles():
     return rgb(picture(H, W)) | {"foo.R": plain(1), "foo.r": plain(2), "foo.red": plain(3)}
 
 
-SOURCES = {"everything": (everything(), {}), "karma": (karma(), {}), "doubles": (doubles(), {})}
+def beside():
+    """A part of half, float and uint channels beside that of the beauty, which is copied whole."""
+    rest = {name: plane for name, plane in everything().items() if name not in "RGBA"}
+    return [("rgba", rgb(picture(H, W)), (0, 0)), ("rest", rest, (0, 0))]
 
 
-SOURCES["stereo"] = (stereo(), {"multiView": ["right", "left"]})
+SOURCES = {name: (make(), {}) for name, make in (("everything", everything), ("karma", karma), ("doubles", doubles))}
+SOURCES |= {"stereo": (stereo(), {"multiView": ["right", "left"]}), "beside": (beside(), {})}

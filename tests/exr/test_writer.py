@@ -228,25 +228,15 @@ def test_multi_part_files_keep_their_parts(tmp_path):
     assert (window.x0, window.y0, window.width, window.height) == (5, -3, 10, 20)
 
 
-def test_mixed_parts_are_copied_whole(tmp_path):
-    """A part of half, float and uint channels beside the beauty's."""
-    rest = {k: v for k, v in everything().items() if k not in "RGBA"}
-    source = [("rgba", rgb(picture(H, W)), (0, 0)), ("rest", rest, (0, 0))]
-    _, _, parts = written(tmp_path, source)
-    for name, plane in rest.items():
-        assert same_bits(parts[1][1][name], plane), name
-
-
 @pytest.mark.parametrize(("layers", "is_held"), [((), True), (("id",), False), (("none",), False)])
 def test_only_parts_that_stay_whole_are_held_in_memory(tmp_path, layers, is_held):
     """One that holds the beauty is split, and so is one of which not all is written."""
-    rest = {name: plane for name, plane in everything().items() if name not in "RGBA"}
     alone = map_render(open_exr(write_exr(tmp_path / "alone.exr", everything())))
     assert bytes_held(alone.file, alone.beauty_channels, WriteOptions(layers=layers)) == 0
-    parts = [("rgba", rgb(picture(H, W)), (0, 0)), ("rest", rest, (0, 0))]
-    beside = map_render(open_exr(write_exr(tmp_path / "beside.exr", parts)))
-    expected = sum(plane.nbytes for plane in rest.values()) if is_held else 0
-    assert bytes_held(beside.file, beside.beauty_channels, WriteOptions(layers=layers)) == expected
+    parts, _ = SOURCES["beside"]
+    both = map_render(open_exr(write_exr(tmp_path / "both.exr", parts)))
+    expected = sum(plane.nbytes for plane in parts[1][1].values()) if is_held else 0
+    assert bytes_held(both.file, both.beauty_channels, WriteOptions(layers=layers)) == expected
 
 
 def test_windows_and_metadata_are_kept(tmp_path):
@@ -333,12 +323,6 @@ def test_nuke_layout_names_layers_by_part_alone(tmp_path):
     assert names["rgba"] == {"R", "G", "B", "A"}
     assert names["crypto00"] == {"R", "G"}
     assert names["depth"] == {"Z"}
-
-
-def test_what_spec_and_multilayer_write_is_read_as_the_same_features(tmp_path):
-    for layout in ("spec", "multilayer"):
-        _, out, _ = written(tmp_path, everything(), WriteOptions(layout=layout))
-        assert {"rgb", "albedo"} <= map_render(open_exr(out)).features.keys()
 
 
 def test_values_beyond_half_are_written_as_its_largest(tmp_path):

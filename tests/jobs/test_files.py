@@ -11,7 +11,6 @@ import OpenEXR
 import pytest
 
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
-from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.jobs import settings as job_settings
@@ -204,34 +203,12 @@ def test_a_new_frame_never_keeps_the_preview_of_the_old_one(pair, tmp_path, bili
     assert png.read_text() == "somebody's picture"
 
 
-def test_an_old_frame_that_can_not_be_replaced_keeps_its_preview(pair, tmp_path, bilinear_models, monkeypatch):
-    out, png = tmp_path / "out.exr", tmp_path / "out.png"
-    out.write_text("old")
-    write_png(png)
-    monkeypatch.setattr("oiio_msspl.exr.writer._write_parts", lambda *_: (_ for _ in ()).throw(MssplError("full")))
-    with pytest.raises(MssplError, match="full"):
-        fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=png, overwrite=True)
-    assert out.read_text() == "old" and is_our_preview(png)
-
-
 def test_what_a_killed_run_left_is_removed_by_the_next(pair, tmp_path, bilinear_models):
     out, png = tmp_path / "out.exr", tmp_path / "out.png"
     left = [leave_temporary(out), leave_temporary(png)]
     assert all(path.exists() for path in left)
     fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=png)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hr.exr", "lr.exr", "out.exr", "out.png"]
-
-
-def test_a_result_may_be_a_link_to_a_name_without_extension(pair, tmp_path, bilinear_models):
-    (tmp_path / "out.exr").symlink_to("stored")
-    fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), overwrite=True)
-    assert open_exr(tmp_path / "stored").parts[0].data_window.width == WIDTH
-
-
-def test_a_result_may_have_the_longest_name(pair, tmp_path, bilinear_models):
-    out = tmp_path / ("x" * 250 + ".exr")
-    fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=out.with_suffix(".png"))
-    assert out.is_file() and out.with_suffix(".png").is_file()
 
 
 # ------------------------------------------------------------------------------------------------ memory

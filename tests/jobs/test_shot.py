@@ -343,18 +343,6 @@ def test_a_picture_that_is_no_preview_of_ours_is_left_alone(tmp_path, bilinear_m
     assert oiio.ImageBuf(str(folder / "out/beauty.1002.png")).spec().width == WIDTH
 
 
-def test_update_leaves_a_picture_that_is_no_preview_of_ours_alone(tmp_path, bilinear_models):
-    folder = make_shot(tmp_path, 1)
-    assert run(folder, bilinear_models[4]).exit_code == 0
-    mine = folder / "out/beauty.1001.png"
-    mine.write_text("my picture")
-    later = (folder / "out/beauty.1001.exr").stat().st_mtime + 9
-    os.utime(folder / "hr/beauty.1001.exr", (later, later))
-    report = run(folder, bilinear_models[4], previews=True, update=True)
-    assert "beauty.1001.png: exists; pass --overwrite" in report.results[1001].message
-    assert mine.read_text() == "my picture"
-
-
 def test_a_frame_that_stays_keeps_its_preview(tmp_path, bilinear_models, monkeypatch):
     """An old frame that can't be replaced, and one that another run puts there meanwhile."""
     folder = make_shot(tmp_path, 1)
@@ -737,18 +725,6 @@ def test_frames_of_two_runs_at_the_same_time_are_skipped(tmp_path, bilinear_mode
     assert report.exit_code == 0
 
 
-def test_two_runs_leave_each_other_s_temporary_files(tmp_path, bilinear_models):
-    """A shot that starts cleans up, and another one is writing a frame at this moment."""
-    folder = make_shot(tmp_path, 2)
-    (folder / "out").mkdir()
-    with replacing(folder / "out/beauty.1002.exr") as temporary:
-        temporary.write_text("half")
-        report = run(folder, bilinear_models[4], frames="1001", skip_existing=True)
-        assert report.exit_code == 0 and temporary.exists()
-        temporary.write_text("whole")
-    assert (folder / "out/beauty.1002.exr").read_text() == "whole"
-
-
 def test_frames_that_are_older_than_an_input_are_named_and_with_update_fused_again(tmp_path, bilinear_models):
     folder = make_shot(tmp_path, 4)
     albedo = write_exr(folder / "albedo.exr", rgb(picture(HEIGHT, WIDTH)))
@@ -820,18 +796,6 @@ def test_a_folder_with_the_name_of_a_frame_does_not_count_as_done(tmp_path, bili
     (folder / "out/beauty.1001.exr").mkdir(parents=True)
     result = run(folder, bilinear_models[4], skip_existing=True).results[1001]
     assert result.status == "failed" and "is a folder" in result.message
-
-
-def test_write_protected_frames_are_not_replaced(tmp_path, bilinear_models):
-    folder = make_shot(tmp_path, 2)
-    assert run(folder, bilinear_models[4]).exit_code == 0
-    published = folder / "out/beauty.1001.exr"
-    published.chmod(0o444)
-    before = published.stat().st_ino
-    report = run(folder, bilinear_models[4], overwrite=True)
-    assert [result.status for result in report.results.values()] == ["failed", "fused"]
-    assert "is write-protected" in report.results[1001].message
-    assert published.stat().st_ino == before
 
 
 def test_a_report_of_another_version_does_not_stop_a_resumed_shot(tmp_path):

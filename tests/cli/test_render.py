@@ -390,25 +390,6 @@ def test_renders_that_cannot_be_fused_are_kept_and_named(farm, model):
 
 
 @posix
-def test_renders_are_kept_beside_each_frame(farm, model):
-    _, run, folder = farm
-    code, out, err, left = run("-o", "out.##.exr", "--frames", "1-2", "--model", model, "--keep", "--json", code=ASKS)
-    assert (code, err) == (0, "")
-    assert left == [f"out.0{number}{suffix}.exr" for number in (1, 2) for suffix in ("", "_hr", "_lr")]
-    assert (folder / "out.01_lr.exr").read_bytes() == (EXAMPLES / "lr.exr").read_bytes()
-    files = [render["file"] for render in json.loads(out)[1]["renders"]]
-    assert files == [str(folder / f"out.02_{suffix}.exr") for suffix in ("lr", "hr")]
-
-
-@posix
-def test_a_shot_and_a_report_for_machines(farm):
-    _, run, _ = farm
-    code, out, _, left = run("-o", "out.##.exr", "--frames", "1-2", "--json")
-    assert (code, left) == (0, ["out.01.exr", "out.02.exr"])
-    assert [report["frame"] for report in json.loads(out)] == [1, 2]
-
-
-@posix
 def test_frames_are_compared_after_the_last_one(farm):
     """Blender tells of each ordinary render, which then belongs to the frame's report."""
     _, run, _ = farm

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shots whose frames are averaged with their neighbours: the same pixels however the shot is cut, resumed or killed."""
+"""Shots whose frames are averaged with their neighbours: the same pixels however the shot is cut or resumed."""
 
 import os
-import signal
 import struct
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -142,30 +138,6 @@ def test_every_second_frame_and_resuming_are_one_run_bit_for_bit(shot, whole, bi
     assert contents(shot / "parts") == contents(shot / "whole")
 
 
-KILLED = """
-import sys
-from oiio_msspl import fuse_shot
-fuse_shot(sys.argv[1], sys.argv[2], sys.argv[3], model=sys.argv[4], skip_existing=True)
-"""
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-def test_a_run_that_is_killed_three_times_is_one_run_bit_for_bit(shot, whole, bilinear_models):
-    out = shot / "killed"
-    out.mkdir()
-    arguments = [sys.executable, "-c", KILLED, *map(str, (shot / "lr", shot / "hr", out, bilinear_models[4]))]
-    for count in (1, 3, 6):
-        process = subprocess.Popen(arguments)
-        deadline = time.monotonic() + 120
-        while len(list(out.glob("hr.*.exr"))) < count and process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    subprocess.run(arguments, check=True)
-    assert contents(out) == contents(shot / "whole")
-
-
 def test_a_frame_without_usable_neighbours_is_the_single_frame_bit_for_bit(tmp_path, bilinear_models):
     """Frames 1001 and 1002 verify the vectors; 1005 is alone, and the neighbours of 1008 are broken."""
     folder = make_moving_shot(tmp_path)
@@ -217,12 +189,6 @@ def test_frames_that_contradict_each_other_are_fused_alone(tmp_path):
     assert "the frames contradict each other on how motion vectors are stored (frames 1001 and 1002" in plan.text
     with pytest.raises(InputError, match=r"contradict each other .* describe them with --motion-format"):
         planned(shot, frames=2)
-
-
-@pytest.mark.parametrize("temporal", ["off", "auto", "2"])
-def test_a_motion_format_that_can_t_be_read_is_refused_at_once(temporal):
-    with pytest.raises(InputError, match="--motion-format 'layer=v,to=sideways': to is next or previous"):
-        TemporalOptions(temporal, "layer=v,to=sideways")
 
 
 def test_other_frames_are_looked_at_if_some_are_broken(tmp_path):
@@ -419,12 +385,6 @@ def test_the_number_of_neighbours_is_checked():
     for wrong in ("two", "-1", "0", 0, "99", 2.5):
         with pytest.raises(InputError, match="give auto, off, or a number of frames from 1 to"):
             TemporalOptions(wrong)
-
-
-def test_neighbours_that_are_asked_for_and_cannot_be_are_an_error(tmp_path, bilinear_models):
-    folder = make_moving_shot(tmp_path, count=1)
-    with pytest.raises(InputError, match="has no two frames that follow each other"):
-        run(folder, bilinear_models[4], "out", 2)
 
 
 def test_update_fuses_a_frame_again_whose_neighbour_is_newer(tmp_path, bilinear_models):

@@ -6,7 +6,6 @@ import json
 import pytest
 
 from oiio_msspl import InputOptions, TemporalOptions, check_files, check_shot, fuse_shot
-from oiio_msspl.errors import InputError
 from tests.conftest import write_exr
 from tests.shots import layers, make_shot
 
@@ -48,12 +47,6 @@ def test_frames_that_differ_from_the_first_one_are_named(shot):
     assert check.fits and check.temporal == ""
     one = check_shot(None, shot / "hr", "1001-1002", temporal=TemporalOptions("off"))
     assert one.codes == {"add_motion", "no_lrhs", "second_seed"}
-
-
-def test_neighbours_that_are_asked_for_need_frames_that_follow_each_other(tmp_path):
-    make_shot(tmp_path, 1)
-    with pytest.raises(InputError, match="no two frames that follow each other"):
-        check_shot(tmp_path / "lr", tmp_path / "hr", temporal=TemporalOptions(2))
 
 
 def test_a_check_of_one_frame_tells_a_missing_albedo(tmp_path):

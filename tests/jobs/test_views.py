@@ -164,14 +164,6 @@ def test_a_plain_lrhs_is_the_partner_of_the_first_view_alone(tmp_path, bilinear_
     assert same_bits(out["bg.Combined.R"], channels_of("bg", 1, 1)["bg.Combined.R"])
 
 
-def test_views_that_are_not_written_are_not_fused(tmp_path, bilinear_models):
-    pair = write_layers(tmp_path)
-    write = WriteOptions(layers=("fg.*",))
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, write=write)
-    assert not any(name.startswith("bg") for name in out)
-    assert [each["view"] for each in report.as_dict()["fused_views"]] == ["fg"]
-
-
 def test_a_view_whose_beauty_is_left_out_is_named(tmp_path, bilinear_models):
     report, out = fused(
         write_layers(tmp_path), tmp_path / "out.exr", bilinear_models, write=WriteOptions(layers=("none",))

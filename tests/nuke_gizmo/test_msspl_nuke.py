@@ -170,16 +170,6 @@ def test_a_mistake_is_one_sentence_and_nothing_runs(host, tmp_path):
     assert results(host) == host.ProgressTask.made == []
 
 
-def test_an_error_of_msspl_fuse_is_shown_as_one_sentence(host, tmp_path):
-    (tmp_path / "lr.1002.exr").write_bytes(b"not an EXR")
-    host.press(host.gizmo, "fuse_frame")
-    host.wait()
-    (message,) = host.messages
-    assert message.startswith(f"MSSPLFuse1: frame 1002: {tmp_path}/lr.1002.exr: ")
-    assert "\n" not in message
-    assert results(host) == []
-
-
 def test_a_bad_frame_does_not_stop_the_range(host, tmp_path):
     (tmp_path / "lr.1002.exr").write_bytes(b"not an EXR")
     host.press(host.gizmo, "fuse_range")

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -91,7 +90,31 @@ def write_preview(
             linear = linear @ to_rec709
         return _srgb_pixels(linear) if view is None else _to_8_bits(_through_ocio(linear, view))
 
-    _write_png(path, display_window, rows, overwrite)
+    with replacing(path, overwrite=overwrite) as temporary:
+        writer = oiio.ImageOutput.create(str(temporary))
+        if writer is None:
+            raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
+        spec = oiio.ImageSpec(display_window.width, display_window.height, 3, "uint8")
+        spec.attribute("oiio:ColorSpace", "sRGB")
+        spec.attribute("Software", SOFTWARE)
+        spec.attribute("png:compressionLevel", 1)
+        # Filter "Sub": every byte minus that of the pixel to the left. Trying all filters would take longer than zlib.
+        spec.attribute("png:filter", 16)
+        # Search for runs of equal bytes only: filtered rows of a render repeat little else.
+        spec.attribute("compression", "rle")
+        ok = writer.open(str(temporary), spec)
+        strips = display_window.bands(ROWS_PER_STRIP)
+        # The next rows are converted while OpenImageIO compresses these: a large frame needs no second copy.
+        for strip, pixels in one_ahead((strip, np.ascontiguousarray(rows(strip))) for strip in strips):
+            ok = ok and writer.write_scanlines(strip.y0 - display_window.y0, strip.y1 - display_window.y0, 0, pixels)
+        ok = writer.close() and ok
+        if not ok:
+            raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")
+        # OpenImageIO does not tell if a full disk cut off the last bytes.
+        with open(temporary, "rb") as file:
+            file.seek(-min(len(PNG_END), temporary.stat().st_size), os.SEEK_END)
+            if file.read() != PNG_END:
+                raise MssplError(f"{path}: can't be written (its end is missing); is the disk full?")
 
 
 def _to_8_bits(display: Array) -> Pixels:
@@ -109,35 +132,6 @@ def _srgb_pixels(linear: Array) -> Pixels:
 def _srgb_table() -> Pixels:
     halves = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
     return _to_8_bits(srgb(np.nan_to_num(halves, posinf=1, neginf=0)))
-
-
-def _write_png(path: Path, window: Window, rows: Callable[[Window], Pixels], overwrite: bool) -> None:
-    """Write the pixels that ``rows`` gives for each strip of a window: a large frame needs no second copy."""
-    with replacing(path, overwrite=overwrite) as temporary:
-        writer = oiio.ImageOutput.create(str(temporary))
-        if writer is None:
-            raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
-        spec = oiio.ImageSpec(window.width, window.height, 3, "uint8")
-        spec.attribute("oiio:ColorSpace", "sRGB")
-        spec.attribute("Software", SOFTWARE)
-        spec.attribute("png:compressionLevel", 1)
-        # Filter "Sub": every byte minus that of the pixel to the left. Trying all filters would take longer than zlib.
-        spec.attribute("png:filter", 16)
-        # Search for runs of equal bytes only: filtered rows of a render repeat little else.
-        spec.attribute("compression", "rle")
-        ok = writer.open(str(temporary), spec)
-        strips = window.bands(ROWS_PER_STRIP)
-        # The next rows are converted while OpenImageIO compresses these.
-        for strip, pixels in one_ahead((strip, np.ascontiguousarray(rows(strip))) for strip in strips):
-            ok = ok and writer.write_scanlines(strip.y0 - window.y0, strip.y1 - window.y0, 0, pixels)
-        ok = writer.close() and ok
-        if not ok:
-            raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")
-        # OpenImageIO does not tell if a full disk cut off the last bytes.
-        with open(temporary, "rb") as file:
-            file.seek(-min(len(PNG_END), temporary.stat().st_size), os.SEEK_END)
-            if file.read() != PNG_END:
-                raise MssplError(f"{path}: can't be written (its end is missing); is the disk full?")
 
 
 def _through_ocio(linear: Array, view: str) -> Array:

@@ -12,7 +12,8 @@ from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.jobs.settings import family_for_noise
 from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, load_model
-from oiio_msspl.model.session import Session
+
+_load_once = functools.cache(load_model)
 
 
 def fuse_arrays(
@@ -55,10 +56,4 @@ def fuse_arrays(
     alignment = align(low, high)
     family = QUALITIES[quality if aovs else min(quality, DEFAULT_QUALITY, key=list(QUALITIES).index)]
     family, _ = family_for_noise(family, low, high, alignment)
-    return fuse(low, high, _session(alignment.scale, family, device, threads))
-
-
-@functools.cache
-def _session(scale: int, family: str, device: str, threads: int) -> Session:
-    """Load a model once for all frames."""
-    return load_model(scale, family, device, threads)
+    return fuse(low, high, _load_once(alignment.scale, family, device, threads))

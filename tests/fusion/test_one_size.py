@@ -149,7 +149,7 @@ def test_arrays_choose_their_model(sigma, monkeypatch):
 
     chosen = []
     monkeypatch.setattr(
-        arrays, "_session", lambda *given: chosen.append(given[:2]) or load_model(*given[:2], threads=1)
+        arrays, "_load_once", lambda *given: chosen.append(given[:2]) or load_model(*given[:2], threads=1)
     )
     images = layers(spp=1)
     images["rgb"] = spread(images["rgb"], sigma) if sigma else images["rgb"]

@@ -33,15 +33,19 @@ def everything(seed=0):
 
 def written(tmp_path, parts, options=None, **attributes):
     """Write a fused frame over a file; returns the fused colour, and what OpenEXR reads back."""
-    path = write_exr(tmp_path / "hr.exr", parts, **attributes)
-    hr = map_render(open_exr(path))
-    height, width = hr.data_window.height, hr.data_window.width
-    fused = np.full((height, width, 3), 0.1, np.float32) + np.arange(3, dtype=np.float32)
-    alpha = np.full((height, width, 1), 0.25, np.float32) if hr.alpha else None
-    out = tmp_path / "out.exr"
-    options = options or WriteOptions()
-    write_fused(out, hr.file, hr.beauty_channels, fused, alpha, {"msspl/model": "test"}, options, overwrite=True)
-    return fused, out, read_bits(out)
+    hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", parts, **attributes)))
+    size = hr.data_window.height, hr.data_window.width
+    fused = np.full((*size, 3), 0.1, np.float32) + np.arange(3, dtype=np.float32)
+    alpha = np.full((*size, 1), 0.25, np.float32) if hr.alpha else None
+    write_beside(hr, options, fused, alpha, {"msspl/model": "test"}, overwrite=True)
+    return fused, tmp_path / "out.exr", read_bits(tmp_path / "out.exr")
+
+
+def write_beside(hr, options=None, image=None, alpha=None, attributes=(), **more):
+    """Write a fused frame, white unless ``image`` is given, as out.exr beside its HRLS; returns what is said of it."""
+    image = np.ones((hr.data_window.height, hr.data_window.width, 3), np.float32) if image is None else image
+    out, options = hr.file.path.with_name("out.exr"), options or WriteOptions()
+    return write_fused(out, hr.file, hr.beauty_channels, image, alpha, dict(attributes), options, **more)
 
 
 def behind_a_deep_part(path, channels, deep=("A", "Z")):

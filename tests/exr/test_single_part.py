@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import numpy as np
 import OpenEXR
 import pytest
 
@@ -7,9 +6,9 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.exr.writer import check_layout, write_fused
+from oiio_msspl.exr.writer import check_layout
 from tests.conftest import HEADER_ONLY, picture, rgb, write_exr
-from tests.exr.sources import H, W, everything, stereo, written
+from tests.exr.sources import H, W, everything, stereo, write_beside, written
 
 
 def test_multilayer_layout_is_one_part(tmp_path):
@@ -62,10 +61,8 @@ def test_metadata_of_all_parts_is_kept(tmp_path):
         file.write(str(tmp_path / "hr.exr"))
     hr = map_render(open_exr(tmp_path / "hr.exr"))
     for layers, is_kept in (((), True), (("depth",), False)):
-        options = WriteOptions(layout="multilayer", layers=layers)
-        out = tmp_path / f"{len(layers)}.exr"
-        write_fused(out, hr.file, hr.beauty_channels, np.ones((H, W, 3), np.float32), None, {}, options)
-        with OpenEXR.File(str(out), header_only=HEADER_ONLY) as file:
+        write_beside(hr, WriteOptions(layout="multilayer", layers=layers), overwrite=True)
+        with OpenEXR.File(str(tmp_path / "out.exr"), header_only=HEADER_ONLY) as file:
             written_header = dict(file.parts[0].header)
         assert (written_header["comments"], written_header["far"]) == ("beauty", 10)
         assert "view" not in written_header

@@ -18,9 +18,9 @@ from oiio_msspl.exr import part_specs
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
-from oiio_msspl.exr.writer import bytes_held, write_fused
+from oiio_msspl.exr.writer import bytes_held
 from tests.conftest import HEADER_ONLY, picture, read_bits, rgb, same_bits, write_exr
-from tests.exr.sources import SOURCES, H, W, behind_a_deep_part, everything, flat, plain, stereo, written
+from tests.exr.sources import SOURCES, H, W, behind_a_deep_part, everything, flat, plain, stereo, write_beside, written
 
 #: Compressions that the OpenEXR of this machine may be too old for.
 NEW = [name for name in ("htj2k256", "htj2k32", "zstd", "lj2k") if hasattr(OpenEXR, f"{name.upper()}_COMPRESSION")]
@@ -31,18 +31,9 @@ def test_layers_about_the_beauty_are_beside_it(tmp_path, layout):
     path = write_exr(tmp_path / "hr.exr", everything())
     error = np.arange(H * W, dtype=np.float32).reshape(H, W, 1)
     normal = -np.arange(H * W * 3, dtype=np.float32).reshape(H, W, 3)
-    image = np.ones((H, W, 4), np.float32)
     hr = map_render(open_exr(path))
-    write_fused(
-        tmp_path / "out.exr",
-        hr.file,
-        hr.beauty_channels,
-        image[..., :3],
-        image[..., 3:],
-        {},
-        WriteOptions(layout, pixel_type="float"),
-        extra={"error": error, "denoised_normal": normal},
-    )
+    options, extra = WriteOptions(layout, pixel_type="float"), {"error": error, "denoised_normal": normal}
+    write_beside(hr, options, alpha=np.ones((H, W, 1), np.float32), extra=extra)
     parts = read_bits(tmp_path / "out.exr")
     layers = flat(parts)
     assert same_bits(layers["error", "Y"], error[..., 0])
@@ -119,10 +110,7 @@ def test_tiled_parts_of_mixed_types_are_passed_on(tmp_path):
         parts.append(OpenEXR.Part(header, channels, name))
     with OpenEXR.File(parts) as file:
         file.write(str(tmp_path / "hr.exr"))
-    hr = map_render(open_exr(tmp_path / "hr.exr"))
-    write_fused(
-        tmp_path / "out.exr", hr.file, hr.beauty_channels, np.ones((H, W, 3), np.float32), None, {}, WriteOptions()
-    )
+    write_beside(map_render(open_exr(tmp_path / "hr.exr")))
     after = flat(read_bits(tmp_path / "out.exr"))
     assert same_bits(after[("m", "X")], plain(1).astype(np.float16))
     assert same_bits(after[("m", "id")], plain(2))
@@ -148,7 +136,7 @@ def test_every_layout_keeps_all_views(tmp_path, layout, stored):
         file.write(str(tmp_path / "hr.exr"))
     hr = map_render(open_exr(tmp_path / "hr.exr"))
     fused = np.ones((H, W, 3), np.float32)
-    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, fused, None, {}, WriteOptions(layout))
+    write_beside(hr, WriteOptions(layout), fused)
     assert (hr.view, hr.other_views) == ("left", ["right"])
     for view in views:
         before, after = (map_render(open_exr(tmp_path / name), view=view) for name in ("hr.exr", "out.exr"))
@@ -175,8 +163,7 @@ def test_every_part_of_a_stereo_file_is_of_one_view(tmp_path, layout, layers):
     """The fused beauty and a layer about it, too. The attribute of a part with several views is not in the result."""
     hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", stereo(), multiView=["right", "left"])), view="left")
     pixels, error = np.ones((H, W, 3), np.float32), {"error": np.ones((H, W, 1), np.float32)}
-    options = WriteOptions(layout, layers=layers)
-    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, pixels, pixels[..., :1], {}, options, extra=error)
+    write_beside(hr, WriteOptions(layout, layers=layers), pixels, pixels[..., :1], extra=error)
     result = open_exr(tmp_path / "out.exr")
     assert "multiView" not in result.metadata
     assert [part.view for part in result.parts[:2]] == ["left", "left"]
@@ -189,17 +176,8 @@ def test_a_damaged_layer_names_the_input(tmp_path):
     noise = np.random.default_rng(0).random((300, 64), dtype=np.float32)
     path = write_exr(tmp_path / "hr.exr", [("rgba", rgb(picture(300, 64)), (0, 0)), ("z", {"z.Z": noise}, (0, 0))])
     path.write_bytes(path.read_bytes()[:-20000])
-    hr = map_render(open_exr(path))
     with pytest.raises(InputError, match=r"hr\.exr: part 1 \(z\).* can't be read"):
-        write_fused(
-            tmp_path / "out.exr",
-            hr.file,
-            hr.beauty_channels,
-            np.ones((300, 64, 3), np.float32),
-            None,
-            {},
-            WriteOptions(),
-        )
+        write_beside(map_render(open_exr(path)))
     assert not (tmp_path / "out.exr").exists()
 
 
@@ -291,8 +269,7 @@ def test_pixel_type_and_compression_of_the_beauty(tmp_path, kind, compression):
 def test_zip_is_fast_rather_than_small(tmp_path):
     """The zlib header of a chunk names the effort: here of the only chunk, in a file of 2 KB."""
     values = picture(16, 16)
-    hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(values.astype(np.float16)))))
-    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, values, None, {}, WriteOptions())
+    write_beside(map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(values.astype(np.float16))))), None, values)
     fastest, default = b"\x78\x01", b"\x78\x5e"
     assert fastest in (tmp_path / "out.exr").read_bytes()
     assert default in (tmp_path / "hr.exr").read_bytes()
@@ -302,16 +279,7 @@ def test_lossy_sources_are_not_compressed_a_second_time(tmp_path):
     """Layers decoded from DWA are stored without loss: encoding them again would change them."""
     path = write_exr(tmp_path / "hr.exr", everything(), compression=OpenEXR.DWAA_COMPRESSION)
     decoded = dict(read_bits(path)[0][1])
-    hr = map_render(open_exr(path))
-    write_fused(
-        tmp_path / "out.exr",
-        hr.file,
-        hr.beauty_channels,
-        np.ones((H, W, 3), np.float32),
-        np.ones((H, W, 1), np.float32),
-        {},
-        WriteOptions(),
-    )
+    write_beside(map_render(open_exr(path)), alpha=np.ones((H, W, 1), np.float32))
     after = flat(read_bits(tmp_path / "out.exr"))
     assert same_bits(after[("albedo", "G")], decoded["albedo.G"])
     assert open_exr(tmp_path / "out.exr").parts[0].compression == "zip"
@@ -327,9 +295,7 @@ def test_nuke_layout_names_layers_by_part_alone(tmp_path):
 
 def test_values_beyond_half_are_written_as_its_largest(tmp_path):
     hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W).astype(np.float16)))))
-    write_fused(
-        tmp_path / "out.exr", hr.file, hr.beauty_channels, np.full((H, W, 3), 1e6, np.float32), None, {}, WriteOptions()
-    )
+    write_beside(hr, None, np.full((H, W, 3), 1e6, np.float32))
     assert (read_bits(tmp_path / "out.exr")[0][1]["R"] == 65504).all()
 
 
@@ -404,9 +370,7 @@ def test_an_unwritable_path_is_our_failure_not_a_traceback(tmp_path, monkeypatch
     hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W)))))
     monkeypatch.setattr(oiio.ImageOutput, "create", staticmethod(lambda path: None))
     with pytest.raises(MssplError, match="OpenImageIO can't write it"):
-        write_fused(
-            tmp_path / "out.exr", hr.file, hr.beauty_channels, np.ones((H, W, 3), np.float32), None, {}, WriteOptions()
-        )
+        write_beside(hr)
 
 
 @pytest.mark.parametrize("layers", [(), ("depth",)])
@@ -414,9 +378,7 @@ def test_a_flat_layer_keeps_its_name_behind_a_deep_part(tmp_path, layers):
     """The deep part's Z does not take the place of the flat one."""
     channels = rgb(picture(8, 8)) | {"Z": picture(8, 8)[..., 0]}
     hr = map_render(open_exr(behind_a_deep_part(tmp_path / "hr.exr", channels)))
-    image = np.ones((8, 8, 3), np.float32)
-    options = WriteOptions(layers=layers)
-    (said,) = write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, image, None, {}, options)
+    (said,) = write_beside(hr, WriteOptions(layers=layers))
     assert said == "part 0 (default) is deep and was not passed on"
     assert [name for name, _ in read_bits(tmp_path / "out.exr")] == ["rgba", "depth"]
 
@@ -435,10 +397,7 @@ def test_what_all_parts_share_may_be_said_by_one_of_them(tmp_path, layout, layer
     ]
     with OpenEXR.File(parts) as file:
         file.write(str(tmp_path / "hr.exr"))
-    hr = map_render(open_exr(tmp_path / "hr.exr"))
-    options = WriteOptions(layout, layers=layers)
-    image = np.ones((H, W, 3), np.float32)
-    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, image, None, {}, options)
+    write_beside(map_render(open_exr(tmp_path / "hr.exr")), WriteOptions(layout, layers=layers))
     with OpenEXR.File(str(tmp_path / "out.exr"), header_only=HEADER_ONLY) as out:
         for part in out.parts:
             np.testing.assert_allclose(part.header["chromaticities"], chromaticities, rtol=1e-6)

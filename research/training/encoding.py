@@ -20,17 +20,7 @@ from torch.nn import functional as F
 from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import LUMINANCE_WEIGHTS
-from oiio_msspl.model.encoding import (
-    BLOCK,
-    KEY,
-    MAX_ALBEDO,
-    MAX_RADIANCE,
-    MIN_BLOCKS,
-    MU,
-    NO_LIGHT,
-    NOISY,
-    SATURATED,
-)
+from oiio_msspl.model.encoding import BLOCK, KEY, MAX_ALBEDO, MAX_RADIANCE, MIN_BLOCKS, MU, NO_LIGHT, NOISY, SATURATED
 
 #: Factor of the logarithm, which makes a log-encoded radiance of 1 a 1.
 LOG_SCALE = 1.0 / math.log1p(MU)

@@ -72,14 +72,7 @@ def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
 
 
 def mean_of_samples(
-    scene: Any,
-    camera: SensorCamera,
-    size: tuple[int, int],
-    spp: int,
-    title: str,
-    placing: Any,
-    *,
-    layers: bool,
+    scene: Any, camera: SensorCamera, size: tuple[int, int], spp: int, title: str, placing: Any, *, layers: bool
 ) -> NDArray[np.float64]:
     """Render samples in launches that fit into memory and average them: (h, w, 15), or (h, w, 3) without layers.
 

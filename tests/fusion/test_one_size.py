@@ -88,15 +88,6 @@ def test_the_share_of_two_renders_is_found_or_given():
     assert error(by_spp) < 0.7 * error(equal)
 
 
-def test_two_renders_of_one_seed_are_refused():
-    first, second = (Render.from_arrays(name, **layers(seed=1)) for name in ("a.exr", "b.exr"))
-    message = r"a\.exr and b\.exr have the same noise; render each with a noise seed of its own"
-    with pytest.raises(InputError, match=message):
-        fuse(first, second, load_model(1, "fast", threads=1))
-    with pytest.raises(InputError, match=message):
-        check_renders(first, second)
-
-
 def test_two_renders_without_noise_are_no_mistake():
     clean = picture(HEIGHT, WIDTH)
     first, second = (Render.from_arrays(name, rgb=clean) for name in ("a", "b"))

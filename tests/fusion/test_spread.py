@@ -9,8 +9,7 @@ from oiio_msspl.fusion.tiles import tiling
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import load_model
-from tests.conftest import noisy, picture
-from tests.fusion.checks.test_spread_noise import spread
+from tests.conftest import noisy, picture, spread
 
 SCALES = (2, 4, 8)
 

@@ -11,8 +11,7 @@ from oiio_msspl.jobs.farm.openjd import make_job
 from oiio_msspl.jobs.plan import TemporalOptions, _is_slow, plan_temporal
 from oiio_msspl.jobs.sequence import find_shot
 from oiio_msspl.model.catalogue import load_model, shipped_models
-from tests.conftest import noisy, picture, read_bits, rgb, write_exr
-from tests.fusion.checks.test_spread_noise import spread
+from tests.conftest import noisy, picture, read_bits, rgb, spread, write_exr
 
 
 def write_pair(folder, name, sigma, extra=None):

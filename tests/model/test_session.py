@@ -12,7 +12,7 @@ import pytest
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.image.filters import box_downsample
-from oiio_msspl.model.catalogue import find_model, shipped_models
+from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS, usable_devices
 from oiio_msspl.model.encoding import encode_radiance
@@ -26,10 +26,6 @@ def pair(session, height, width, value=0.0):
     lrhs = {name: np.full((height, width, 3), value, np.float32) for name in contract.lrhs}
     size = height * contract.scale, width * contract.scale
     return lrhs, {name: np.full((*size, HRLS_FEATURES[name]), value, np.float32) for name in contract.hrls}
-
-
-def test_a_model_ships_for_every_scale():
-    assert {f"{family}-x{s}" for family in ("paper", "joint-small") for s in SCALES} <= shipped_models().keys()
 
 
 @pytest.mark.parametrize("scale", SCALES)

@@ -204,7 +204,7 @@ def _trust_in_points(
     # disagree where one of them is dark.
     least = change if scale > 1 else np.maximum(change, np.float32(LARGEST))
     common = np.clip(common, -least, np.where(darker, zero, change))
-    weight = np.float32(LARGEST) / np.maximum(change, np.float32(LARGEST))
+    weight = 1 / np.maximum(change / np.float32(LARGEST), 1)
     agreed, total = (means_around(weight * values, [size])[0] for values in (common, brighter))
     share = agreed / (total + np.float32(DOUBT / (2 * size + 1) ** 2))
     scattered = np.clip((share - AGREED[0]) / (AGREED[1] - AGREED[0]), 0, 1)

@@ -32,9 +32,9 @@ LARGEST = 16.0
 #: points. On fireflies they agree nowhere. It is also judged where its energy is this many times the largest noise
 #: around: a lamp alone.
 AGREED, ALONE = (0.3, 0.6), 16.0
-#: Squared relative difference that is too small for a point, and the sum of those without agreement that counts as
-#: well: a few points may agree by chance. ``AROUND`` is how far "around" reaches, in LRHS pixels.
-POINT, DOUBT, AROUND = 0.1, 8.0, 15
+#: Squared relative difference of an LRHS pixel that is too small for a point, and the sum of those without agreement
+#: that counts as well: a few points may agree by chance. ``AROUND`` is how far "around" reaches, in LRHS pixels.
+POINT, DOUBT, AROUND = 0.1, 32.0, 15
 #: Share of the pixels of a window that are darker than the picture if light may be missing.
 MOSTLY = 0.6
 #: Noise counts this many times where a pixel is judged by itself.
@@ -198,18 +198,18 @@ def _trust_in_points(
     The arguments are those of :func:`_trust_in_areas`.
     """
     size, zero = min(AROUND, reach // 2), np.float32(0)
-    light, brighter = (np.where(darker, zero, values) for values in (energy, change))
+    is_point = change > np.float32(POINT)
+    light, brighter = np.where(darker, zero, energy), np.where(is_point & ~darker, change, zero)
     # A firefly of the LRHS counts no more than the HRLS. The mean of two renders of one size tells nothing of what only
     # one of them has. In most pixels with little noise both are brighter than the mean, and so agree by chance. They
     # disagree where one of them is dark.
     least = change if scale > 1 else np.maximum(change, np.float32(LARGEST))
-    common = np.clip(common, -least, np.where(darker, zero, change))
+    common = np.clip(common, -least, brighter)
     weight = 1 / np.maximum(change / np.float32(LARGEST), 1)
     agreed, total = (means_around(weight * values, [size])[0] for values in (common, brighter))
     share = agreed / (total + np.float32(DOUBT / (2 * size + 1) ** 2))
     scattered = np.clip((share - AGREED[0]) / (AGREED[1] - AGREED[0]), 0, 1)
     alone = _kept(light, np.float32(ALONE) * max_around(noise, size))
-    is_point = energy > np.float32(POINT)
     return is_point * np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
 
 

@@ -34,7 +34,7 @@ FEW = 0.05
 #: Rows and columns around a pixel that decide on it.
 REACH = 4 + AROUND
 #: Pixels by which vectors are judged, at most, and at least.
-MOST_SAMPLES, FEWEST_SAMPLES = 16384, 64
+MOST_SAMPLES, FEWEST_SAMPLES = 4096, 64
 #: Vectors are judged where they are longer than this, in pixels.
 MOVES = 0.5
 #: Vectors mislead if a vote of the pixels is this many standard deviations from a tie.

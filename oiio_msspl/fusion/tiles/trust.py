@@ -200,9 +200,10 @@ def _trust_in_points(
     size, zero = min(AROUND, reach // 2), np.float32(0)
     is_point = change > np.float32(POINT)
     light, brighter = np.where(darker, zero, energy), np.where(is_point & ~darker, change, zero)
-    # A firefly of the LRHS counts no more than the HRLS. The mean of two renders of one size tells nothing of what only
-    # one of them has. In most pixels with little noise both are brighter than the mean, and so agree by chance. They
-    # disagree where one of them is dark.
+    # A product counts no more than the change of the HRLS, or a firefly of the LRHS would outweigh all pixels around.
+    # At scale 1, the change is that of the mean of both renders. It is small where these disagree, which must count.
+    # Most pixels with little noise are brighter than the mean in both renders, and so agree by chance. Where one of
+    # them is dark they disagree. So darker pixels can only count against.
     least = change if scale > 1 else np.maximum(change, np.float32(LARGEST))
     common = np.clip(common, -least, brighter)
     weight = 1 / np.maximum(change / np.float32(LARGEST), 1)

@@ -99,6 +99,11 @@ class _Picture:
         return repair(values)[0] if layer.is_colour else values
 
 
+def check_layers(comparison: Comparison, layers: Sequence[str]) -> None:
+    """Raise InputError if no file has a layer of a pattern, by the headers alone."""
+    _chosen(list(map(_picture, comparison.renders, comparison.windows)), layers)
+
+
 def write_page(
     path: Path,
     comparison: Comparison,

@@ -63,6 +63,7 @@ def compare(
         open_comparison,
         score_images,
     )
+    from oiio_msspl.compare_page import check_layers
 
     if reference is None and html is None:
         raise InputError("scores need --reference; without one, --html writes a page to look at")
@@ -71,6 +72,8 @@ def compare(
     if html is not None:
         check_page(html, [*images, reference] if reference else images, overwrite=overwrite)
     comparison = open_comparison(images, reference, _layer(mapping))
+    if html is not None:
+        check_layers(comparison, layers)
     for note_on in (note_on_views, note_on_windows, note_on_spaces, note_on_weights):
         if note := note_on(comparison):
             console.say(note, error=True)

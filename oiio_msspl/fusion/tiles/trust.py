@@ -46,8 +46,8 @@ ROUNDING = 2.0**-12
 #: Reach of the windows of the light's correction, in cells of each level, and its largest factor. The smallest cells
 #: have this side in HRLS pixels, unless LRHS pixels are larger.
 LIGHT_REACH, LARGEST_FACTOR, CELL = 3, 2.0, 4
-#: Pixels do not count for the light around them if both renders are brighter by this many times the local brightness:
-#: a lamp that the network has removed.
+#: A pixel of a render does not count for the light around it where the other render is brighter than the picture by
+#: this many times the local brightness: a lamp that the network has removed.
 LAMP = 1.0
 
 
@@ -143,15 +143,13 @@ def _trust_in_areas(
         darker: the renders are darker than the picture.
         scale, reach: as in :func:`trust_renders`.
     """
-    levels = 1
-    while levels < LEVELS and 2 * WINDOW * 2**levels <= reach:
-        levels += 1
     most, largest = np.float32(LARGEST * scale**2), np.float32(LARGEST)
     energy, least = np.minimum(energy, most), np.minimum(noise, most)
     common, change = np.clip(common, -largest, largest), np.minimum(change, largest)
     lit: Array = np.where(darker, np.minimum(common, np.float32(0)), common)
     squares, share = (np.square(energy) + np.square(least), common * common), darker.astype(np.float32)
-    trust, _ = _trust_in_windows([energy, least, common, change, lit, *squares, share, noise], levels)
+    planes = [energy, least, common, change, lit, *squares, share, noise]
+    trust, _ = _trust_in_windows(planes, min(_levels(WINDOW, reach), LEVELS))
     return trust
 
 
@@ -214,6 +212,14 @@ def _trust_in_points(
     return is_point * np.maximum(scattered, alone).astype(np.float32) * _kept(energy, np.float32(PIXEL) * noise)
 
 
+def _levels(window: int, reach: int) -> int:
+    """Return how many levels depend on pixels within ``reach``, if windows reach ``window`` pixels on the first one.
+
+    A level averages twice over its windows, which are twice as large on the next one.
+    """
+    return max(1, (reach // (2 * window)).bit_length())
+
+
 def _certainty(excess: Array, squares: Array, count: int) -> Array:
     """Return how certain it is that the mean of a window exceeds 0: 0 up to ``DOUBTFUL``, 1 from ``CERTAIN`` on.
 
@@ -273,11 +279,9 @@ def _light_factor(own: Array, lrhs: Array, mean: Array, share: float, scale: int
     cell = 1
     while cell * scale < CELL:
         low, high, cell = halved(low), halved(high), 2 * cell
-    levels = 1
-    while LIGHT_REACH * 2 ** (levels + 1) * cell <= reach:
-        levels += 1
     height, width = own.shape
-    agreed = upsample_linear(_agreed(low, high, np.float32(share), levels), cell)[:height, :width]
+    agreed = _agreed(low, high, np.float32(share), _levels(LIGHT_REACH * cell, reach))
+    agreed = upsample_linear(agreed, cell)[:height, :width]
     change = brightness * agreed / np.maximum(own, 0.01 * brightness)
     return np.clip(1 + change, 1 / LARGEST_FACTOR, LARGEST_FACTOR).astype(np.float32)
 

@@ -113,9 +113,10 @@ def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def folder(tmp_path: Path) -> Path:
     """The files that pages name: a pair, its reference, a shot in folders and by patterns, and files shown on pages."""
     shutil.copytree(EXAMPLES, tmp_path / "examples")
-    shutil.copytree(EXAMPLES, tmp_path / "demo")  # a pair that a page renders
-    shutil.copy(EXAMPLES / "hr.exr", tmp_path / "demo/ref.exr")
     (tmp_path / "docs").mkdir()
+    (tmp_path / "demo").mkdir()  # what a page renders
+    for name, kind in {"fused": "hr", "fused_hr": "hr", "fused_lr": "lr", "clean_hr": "hr"}.items():
+        shutil.copy(EXAMPLES / f"{kind}.exr", tmp_path / f"demo/{name}.exr")
     for name in ("lr", "hr"):
         source = EXAMPLES / f"{name}.exr"
         shutil.copy(source, tmp_path)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from oiio_msspl.findings import Finding
     from oiio_msspl.fusion.fuse import FusedFrame, fuse
     from oiio_msspl.inspection import Inspection, inspect_file
-    from oiio_msspl.jobs.arrays import fuse_arrays
+    from oiio_msspl.jobs.arrays import ArrayFrame, FusedArrays, fuse_array_shot, fuse_arrays
     from oiio_msspl.jobs.farm.openjd import Job, make_job, write_bundle
     from oiio_msspl.jobs.files import fuse_files
     from oiio_msspl.jobs.fitting import PairCheck, ShotCheck, check_files, check_shot
@@ -49,7 +49,8 @@ if TYPE_CHECKING:
 _NAMES = {
     "aovs.mapped_render": "MappedRender", "aovs.matching": "map_render", "errors": "InputError MssplError",
     "exr.reader": "open_exr", "exr.render": "Render Window", "exr.write_options": "WriteOptions", "findings": "Finding",
-    "fusion.fuse": "FusedFrame fuse", "inspection": "Inspection inspect_file", "jobs.arrays": "fuse_arrays",
+    "fusion.fuse": "FusedFrame fuse", "inspection": "Inspection inspect_file",
+    "jobs.arrays": "ArrayFrame FusedArrays fuse_array_shot fuse_arrays",
     "jobs.farm.openjd": "Job make_job write_bundle", "jobs.files": "fuse_files",
     "jobs.fitting": "PairCheck ShotCheck check_files check_shot", "jobs.inputs": "InputOptions",
     "jobs.plan": "TemporalOptions", "jobs.report": "FrameReport", "jobs.sequence": "Shot find_shot",
@@ -59,11 +60,11 @@ _NAMES = {
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
-    "Contract", "Finding", "FrameReport", "FrameResult", "FusedFrame", "InputError", "InputOptions", "Inspection",
-    "Job", "MappedRender", "MssplError", "PairCheck", "Render", "Session", "Shot", "ShotCheck", "ShotReport",
-    "TemporalOptions", "Window", "WriteOptions", "__version__", "check_files", "check_shot", "find_model", "find_shot",
-    "fuse", "fuse_arrays", "fuse_files", "fuse_shot", "inspect_file", "make_job", "map_render", "open_exr",
-    "shipped_models", "write_bundle",
+    "ArrayFrame", "Contract", "Finding", "FrameReport", "FrameResult", "FusedArrays", "FusedFrame", "InputError",
+    "InputOptions", "Inspection", "Job", "MappedRender", "MssplError", "PairCheck", "Render", "Session", "Shot",
+    "ShotCheck", "ShotReport", "TemporalOptions", "Window", "WriteOptions", "__version__", "check_files", "check_shot",
+    "find_model", "find_shot", "fuse", "fuse_array_shot", "fuse_arrays", "fuse_files", "fuse_shot", "inspect_file",
+    "make_job", "map_render", "open_exr", "shipped_models", "write_bundle",
 ]  # fmt: skip
 
 

@@ -1,17 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuses a frame from arrays, and chooses the model itself."""
+"""Fuses a frame or a shot from arrays, and chooses the model itself."""
 
 from __future__ import annotations
 
 import functools
+import re
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from oiio_msspl.errors import InputError
+import numpy as np
+
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr.atomic import not_written
+from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Render
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.arrays import Array, planes_of
+from oiio_msspl.jobs.inputs import InputOptions
+from oiio_msspl.jobs.plan import AUTO, TemporalOptions
 from oiio_msspl.jobs.settings import family_for_noise
+from oiio_msspl.jobs.shot import fuse_shot
 from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, load_model
+
+#: The channels of some layers in temporary files. Others have R, G and B behind their name.
+_CHANNELS = {"rgb": ("R", "G", "B"), "alpha": ("A",), "motion": ("motion.x", "motion.y")}
+#: How :class:`ArrayFrame` stores motion vectors.
+_MOTION = "layer=motion,to=next,x=right,y=down,unit=pixels,scale=1,offset=0"
 
 _load_once = functools.cache(load_model)
 
@@ -45,6 +64,7 @@ def fuse_arrays(
         The fused frame: ``rgb`` (height, width, 3), and warnings.
 
     Raises:
+        ValueError: an array has another shape than it must have, or no floats.
         InputError: the arrays do not fit together, there is no such quality, or the device can't be used.
     """
     if quality not in QUALITIES:
@@ -57,3 +77,135 @@ def fuse_arrays(
     family = QUALITIES[quality if aovs else min(quality, DEFAULT_QUALITY, key=list(QUALITIES).index)]
     family, _ = family_for_noise(family, low, high, alignment)
     return fuse(low, high, _load_once(alignment.scale, family, device, threads))
+
+
+@dataclass(frozen=True)
+class ArrayFrame:
+    """A frame of a shot, rendered, as arrays of floats. All but ``lr`` and ``lr_passes`` are of ``hr``."""
+
+    hr: Array
+    """(height, width, 3), scene linear."""
+    lr: Array | None = None
+    """A second render with noise of its own, as for :func:`fuse_arrays`."""
+    albedo: Array | None = None
+    """(height, width, 3)."""
+    normal: Array | None = None
+    """(height, width, 3), from -1 to 1."""
+    alpha: Array | None = None
+    """(height, width, 1)."""
+    motion: Array | None = None
+    """(height, width, 2): from a pixel to the place of its surface in the next frame, in pixels, as (x, y) with y
+    downwards. NaN where it is not known."""
+    passes: Mapping[str, Array] = field(default_factory=dict)
+    """Layers (height, width, 3) that sum to ``hr``, by name."""
+    lr_passes: Mapping[str, Array] = field(default_factory=dict)
+    """The same layers of ``lr``. Those that it lacks keep more noise."""
+
+
+@dataclass(frozen=True)
+class FusedArrays:
+    """A frame of a shot, fused, as float32 arrays."""
+
+    rgb: Array
+    """(height, width, 3), scene linear."""
+    alpha: Array | None
+    """(height, width, 1)."""
+    passes: dict[str, Array]
+    """(height, width, 3) each. They sum to ``rgb``."""
+    warnings: list[Finding]
+
+
+def fuse_array_shot(
+    frames: Iterable[ArrayFrame],
+    *,
+    temporal: str | int = AUTO,
+    quality: str = DEFAULT_QUALITY,
+    device: str = "cpu",
+    threads: int = 0,
+) -> Iterator[FusedArrays]:
+    """Fuse the frames of a shot, each with its neighbours, and their passes.
+
+    The frames are one after the other in time, and all have the same arrays. They wait in temporary files, so memory
+    holds few of them. A single frame is a shot, too.
+
+    Args:
+        frames: in their order.
+        temporal: as for :func:`oiio_msspl.fuse_shot`.
+        quality, device, threads: as for :func:`fuse_arrays`.
+
+    Yields:
+        The frames in their order, when all are fused.
+
+    Raises:
+        ValueError: an array has another shape than it must have, or no floats.
+        InputError: the arrays of a frame do not fit together, or an option is wrong.
+        MssplError: the network failed, or the disk has no room.
+    """
+    with tempfile.TemporaryDirectory(prefix="msspl-") as name:
+        folder = Path(name)
+        names: list[str] = []
+        number, with_lr, moves = 0, False, False
+        for number, frame in enumerate(frames, 1):
+            names, with_lr = list(frame.passes), frame.lr is not None
+            aovs = {"albedo": frame.albedo, "normal": frame.normal, "alpha": frame.alpha}
+            motion = {} if frame.motion is None else {"motion": np.asarray(frame.motion)}
+            moves |= any(np.any(vectors) for vectors in motion.values())
+            _write(folder / f"hr/hr.{number:04d}.exr", frame.hr, aovs, {**frame.passes, **motion})
+            if frame.lr is not None:
+                _write(folder / f"lr/lr.{number:04d}.exr", frame.lr, {}, frame.lr_passes)
+        if not number:
+            return
+        report = fuse_shot(
+            folder / "lr" if with_lr else None,
+            folder / "hr",
+            folder / "out",
+            inputs=InputOptions(sums=(f"passes={'+'.join(names)}",) if names else ()),
+            write=WriteOptions(pixel_type="float"),
+            temporal=TemporalOptions(temporal, _MOTION if moves else None),
+            model=quality,
+            device=device,
+            threads=threads,
+        )
+        for result in report.results.values():
+            if result.exit_code:
+                raise (InputError if result.exit_code == 2 else MssplError)(result.message)
+        for result in report.results.values():
+            yield _read(result.output, names, result.warnings)
+
+
+def _write(path: Path, rgb: Array, aovs: Mapping[str, Array | None], layers: Mapping[str, Array]) -> None:
+    """Write a render of a shot with more layers, without compression."""
+    import OpenEXR
+
+    features = {name: image for name, image in aovs.items() if image is not None}
+    render = Render.from_arrays(path.name, rgb=rgb, **features)
+    planes: dict[str, Array] = {}
+    for name, image in (render.layers | {key: np.asarray(value) for key, value in layers.items()}).items():
+        channels = _channels_of(name)
+        if image.shape != (*rgb.shape[:2], len(channels)):
+            expected = (*rgb.shape[:2], len(channels))
+            raise InputError(f"{path.name}: {name} has the shape {image.shape}, and not {expected}")
+        if re.fullmatch(r"[\w-]+", name) is None:
+            raise InputError(f"{path.name}: pass {name!r}: name it with letters, digits, _ and -")
+        planes |= zip(channels, planes_of(image).astype(np.float32, copy=False), strict=True)
+    path.parent.mkdir(exist_ok=True)
+    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
+    try:
+        with OpenEXR.File(header, planes) as file:
+            file.write(str(path))
+    except Exception as error:
+        raise not_written(path.parent, str(error)) from error
+
+
+def _read(path: str, passes: Sequence[str], warnings: list[Finding]) -> FusedArrays:
+    """Read a fused frame."""
+    file = open_exr(path)
+    stored = {channel.name: channel for part in file.parts for channel in part.channels}
+    names = ("rgb", *(["alpha"] if "A" in stored else []), *passes)
+    images = {name: file.read([stored[key] for key in _channels_of(name)], file.display_window) for name in names}
+    return FusedArrays(images.pop("rgb"), images.pop("alpha", None), images, warnings)
+
+
+def _channels_of(layer: str) -> Sequence[str]:
+    """Return the names of a layer's channels in the files."""
+    return _CHANNELS.get(layer) or [f"{layer}.{component}" for component in "RGB"]

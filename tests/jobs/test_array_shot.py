@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A shot given as arrays."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl import ArrayFrame, InputError, fuse_array_shot
+from tests.conftest import downsample, noisy
+from tests.moving_plane import HEIGHT, WIDTH, positions, texture, truck, vectors
+
+FRAMES = range(5)
+SHARES = {"key": 0.7, "fill": 0.3}
+
+
+def clean(t):
+    return texture(*np.moveaxis(positions(truck, t)[..., :2], -1, 0))
+
+
+def passes(t, scale, spp):
+    """Passes with noise of their own, by name."""
+    image = downsample(clean(t), scale)
+    return {name: noisy(share * image, spp, [t, scale, i]) for i, (name, share) in enumerate(SHARES.items())}
+
+
+def rendered(t, *, two):
+    own, low = passes(t, 1, 2), passes(t, 2, 8)
+    pair = {"lr": sum(low.values()), "lr_passes": low} if two else {}
+    return ArrayFrame(sum(own.values()), albedo=clean(t), motion=vectors(truck, t, 1), passes=own, **pair)
+
+
+@pytest.mark.parametrize("two", [False, True])
+def test_neighbours_and_passes_of_arrays_are_fused(two):
+    frames = [rendered(t, two=two) for t in FRAMES]
+    alone, averaged = (list(fuse_array_shot(frames, temporal=over_time, quality="fast")) for over_time in ("off", 2))
+    assert [frame.rgb.shape for frame in averaged] == [(HEIGHT, WIDTH, 3)] * len(FRAMES)
+    for t, single, fused in zip(FRAMES, alone, averaged, strict=True):
+        pictures = (frames[t].hr, single.rgb, fused.rgb)
+        errors = [np.square(picture - clean(t)).mean() for picture in pictures]
+        assert errors[2] < 0.9 * errors[1] < 0.5 * errors[0]
+        assert list(fused.passes) == list(SHARES)
+        np.testing.assert_allclose(sum(fused.passes.values()), fused.rgb, atol=1e-5)
+
+
+def test_arrays_that_do_not_fit_are_named():
+    frame = rendered(0, two=False)
+    wrong = {"key": frame.passes["key"][:-1], "fill": frame.passes["fill"]}
+    with pytest.raises(InputError, match=r"hr\.0002\.exr: key has the shape \(95, 160, 3\), and not \(96, 160, 3\)"):
+        list(fuse_array_shot([frame, ArrayFrame(frame.hr, passes=wrong)]))
+    with pytest.raises(InputError, match=r"pass 'a\+b': name it with letters"):
+        list(fuse_array_shot([ArrayFrame(frame.hr, passes={"a+b": frame.hr})]))
+    with pytest.raises(InputError, match="render the LRHS at one of 80x48"):
+        list(fuse_array_shot([ArrayFrame(frame.hr, lr=frame.hr[:32])]))
+    assert list(fuse_array_shot([])) == []

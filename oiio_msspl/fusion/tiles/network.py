@@ -26,7 +26,7 @@ from oiio_msspl.fusion.tiles.guards import (
 )
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile, alpha_as_colour
 from oiio_msspl.fusion.tiles.tiling import Tile
-from oiio_msspl.fusion.tiles.trust import Renders, trust_renders
+from oiio_msspl.fusion.tiles.trust import trust_renders
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
 from oiio_msspl.image.filters import all_within, box_downsample, enlarged
 from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
@@ -164,8 +164,8 @@ def _fuse_alpha(tile: TileFeatures, session: Session, shares: Shares, *, trust: 
     check_finite(session, grey)
     fused = grey.mean(axis=-1, keepdims=True)
     if trust and RGB in shares:
-        renders = Renders(lrhs_alpha, hrls_alpha, shares[RGB], 1.0)
-        fused, _ = trust_renders(fused, renders, session.contract.overlap)
+        reach = session.contract.overlap
+        fused, _ = trust_renders(fused, lrhs_alpha, hrls_alpha, share=shares[RGB], exposure=1.0, reach=reach)
     fused = np.clip(fused, 0.0, 1.0)
     for value, mask in enumerate(exact):
         near = all_within(mask, 1) & (np.abs(fused - np.float32(value)) < INVISIBLE)
@@ -178,14 +178,14 @@ def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shar
     if result.trust is None or tile.noise_free or RGB not in shares:
         return fused
     assert tile.lrhs is not None and tile.hrls is not None
-    lrhs, borrowed = tile.lrhs[RGB], tile.features.borrowed
+    lrhs, borrowed, scale = tile.lrhs[RGB], tile.features.borrowed, tile.features.scale
     if borrowed is not None:
-        lrhs = np.where(borrowed[..., None], box_downsample(fused, result.alignment.scale), lrhs)
-    renders = Renders(lrhs, tile.hrls[RGB], shares[RGB], result.exposure)
-    picture, trust = trust_renders(fused, renders, reach)
+        lrhs = np.where(borrowed[..., None], box_downsample(fused, scale), lrhs)
+    share, exposure = shares[RGB], result.exposure
+    picture, trust = trust_renders(fused, lrhs, tile.hrls[RGB], share=share, exposure=exposure, reach=reach)
     if borrowed is not None:  # there, the renders are not independent
         trust[borrowed] = 0
-        picture = np.where(repeated(borrowed[..., None], renders.scale), fused, picture)
+        picture = np.where(repeated(borrowed[..., None], scale), fused, picture)
     core, area = tile.features.core, tile.features.lrhs_area
     result.trust[core.slices(result.alignment.grid)] = trust[core.slices(area)]
     return picture

@@ -10,13 +10,12 @@ Denoising of Monte Carlo Rendered Images*). ``docs/design/trust.md`` has the ste
 from __future__ import annotations
 
 from functools import reduce
-from typing import NamedTuple
 
 import numpy as np
 
 from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import blurred, box_downsample, halved, max_around, means_around, upsample_linear
-from oiio_msspl.image.parallel import for_row_blocks, two_at_a_time
+from oiio_msspl.image.parallel import two_at_a_time
 
 #: Reach of the windows in which energies are compared, in cells of each level; and how many levels there are: of cells
 #: of 1, 2 and 4 LRHS pixels. Large windows find faint detail, small ones find where it ends. They hold fewer pixels,
@@ -51,83 +50,62 @@ LIGHT_REACH, LARGEST_FACTOR, CELL = 3, 2.0, 4
 LAMP = 1.0
 
 
-class Renders(NamedTuple):
-    """Both renders of a tile, and what is known of their noise."""
-
-    lrhs: Array
-    """(h, w, c), scene linear."""
-    hrls: Array
-    """(s*h, s*w, c), scene linear. At scale 1, the second render of the same size."""
-    share: float
-    """Share of the LRHS in the mean of both renders that has the least noise."""
-    exposure: float
-    """Factor that brings the scene to a log-mean luminance of mid-grey."""
-
-    @property
-    def scale(self) -> int:
-        """HRLS pixels along a side of an LRHS pixel."""
-        return len(self.hrls) // len(self.lrhs)
-
-
-def trust_renders(fused: Array, renders: Renders, reach: int) -> tuple[Array, Array]:
+def trust_renders(
+    fused: Array, lrhs: Array, hrls: Array, *, share: float, exposure: float, reach: int
+) -> tuple[Array, Array]:
     """Put back detail and light that both renders show.
 
     Detail is taken from the HRLS, or from the mean of two renders of one size.
 
     Args:
         fused: the network's picture (s*h, s*w, c), scene linear.
-        renders: the renders of the tile, without fireflies.
+        lrhs, hrls: both renders of the tile, (h, w, c) and (s*h, s*w, c), scene linear, without fireflies.
+        share: of the LRHS in the mean of both renders that has the least noise.
+        exposure: factor that brings the scene to a log-mean luminance of mid-grey.
         reach: the largest distance, in LRHS pixels, over which a pixel may depend on others.
 
     Returns:
         The picture (s*h, s*w, c), >= 0, and how much of the HRLS's difference was put back, (h, w) in [0, 1].
     """
-    scale, exposure = renders.scale, np.float32(renders.exposure)
-    picture, render, low = (planes_of(image) for image in (fused, renders.hrls, renders.lrhs))
+    scale = len(hrls) // len(lrhs)
+    render = planes_of(hrls if scale > 1 else hrls + np.float32(share) * (lrhs - hrls))
     # Evidence is weighed at the LRHS's resolution, in exposed units, in which squares neither overflow nor vanish.
-    lrhs, means, own = (
-        [_exposed(box_downsample(plane, factor), exposure) for plane in planes]
-        for planes, factor in ((low, 1), (render, scale), (picture, scale))
+    low, high, own = (
+        _exposed(planes_of(box_downsample(image, factor)), exposure)
+        for image, factor in ((lrhs, 1), (hrls, scale), (fused, scale))
     )
-    if scale == 1:
-        render = render + np.float32(renders.share) * (low - render)
-    light = list(zip(own, lrhs, means, strict=True))
-    factors = two_at_a_time(lambda planes: _light_factor(*planes, renders.share, scale, reach), light)
-    own = [plane * factor for plane, factor in zip(own, factors, strict=True)]
-    relative = len(picture) * np.square(_brightness(reduce(np.add, own) / np.float32(len(own))))
-    picture = np.stack([plane * upsample_linear(factor, scale) for plane, factor in zip(picture, factors, strict=True)])
+    light = list(zip(own, low, high, strict=True))
+    factors = two_at_a_time(lambda planes: _light_factor(*planes, share, scale, reach), light)
+    own = own * np.stack(factors)
+    scaled = zip(planes_of(fused), factors, strict=True)
+    picture = np.stack([plane * upsample_linear(factor, scale) for plane, factor in scaled])
     # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of
-    # the mean of both renders is E d^2 share (1 - share).
-    variance = np.float32(renders.share * (scale**2 if scale > 1 else 1 - renders.share))
-    noise = variance * reduce(np.add, (_squared_noise(a, b) for a, b in zip(lrhs, means, strict=True)))
-    target = means if scale > 1 else [_exposed(plane, exposure) for plane in render]
-    darker = reduce(np.add, (best - mine for best, mine in zip(target, own, strict=True))) < 0
-    common = reduce(np.add, ((a - mine) * (b - mine) for a, b, mine in zip(lrhs, means, own, strict=True)))
-    change = reduce(np.add, (np.square(best - mine) for best, mine in zip(target, own, strict=True)))
-    energy = _squared_difference(picture, render, scale, exposure) if scale > 1 else change
+    # the mean of both renders is E d^2 share (1 - share). Both renders are rounded to half floats.
+    variance = np.float32(share * (scale**2 if scale > 1 else 1 - share))
+    rounding = np.float32(2 * ROUNDING**2) * np.square(np.maximum(low, high))
+    noise = variance * (np.square(low - high) + rounding).sum(axis=0)
+    best = high if scale > 1 else _exposed(render, exposure)
+    darker = (best - own).sum(axis=0) < 0
+    common = ((low - own) * (high - own)).sum(axis=0)
+    energy = change = np.square(best - own).sum(axis=0)
+    if scale > 1:
+        differences = two_at_a_time(lambda i: _exposed(render[i] - picture[i], exposure), range(len(render)))
+        energy = box_downsample(reduce(np.add, map(np.square, differences)), scale)
+    relative = len(own) * np.square(_brightness(own.mean(axis=0)))
     energy, noise, common, change = (values / relative for values in (energy, noise, common, change))
     points = _trust_in_points(energy, noise, common, change, darker, scale, reach)
     trust = np.maximum(_trust_in_areas(energy, noise, common, change, darker, scale, reach), points)
-    _blend(picture, render, trust, points)
+    # Points are whole LRHS pixels; between areas, trust is interpolated.
+    weight = np.maximum(upsample_linear(trust, scale), points.repeat(scale, axis=0).repeat(scale, axis=1))
+    for plane, pixels in zip(picture, render, strict=True):
+        plane += weight * (pixels - plane)
     return np.moveaxis(picture, 0, -1), trust
 
 
-def _exposed(plane: Array, exposure: np.float32) -> Array:
+def _exposed(values: Array, exposure: float) -> Array:
     """Return radiance times the exposure, limited to ``BRIGHTEST``."""
     with np.errstate(over="ignore"):
-        return np.clip(plane * exposure, -BRIGHTEST, BRIGHTEST)
-
-
-def _squared_difference(picture: Array, render: Array, scale: int, exposure: np.float32) -> Array:
-    """Return the squared difference of planes (c, s*h, s*w), in exposed units: its mean in an LRHS pixel, (h, w)."""
-    result = np.empty((len(picture[0]) // scale, picture.shape[2] // scale), np.float32)
-
-    def work(rows: slice) -> None:
-        squares = (np.square(_exposed(a[rows] - b[rows], exposure)) for a, b in zip(render, picture, strict=True))
-        result[rows.start // scale : rows.stop // scale] = box_downsample(reduce(np.add, squares), scale)
-
-    for_row_blocks(work, picture.shape[1], picture.shape[2], multiple=scale)
-    return result
+        return np.clip(values * np.float32(exposure), -BRIGHTEST, BRIGHTEST)
 
 
 def _trust_in_areas(
@@ -141,7 +119,6 @@ def _trust_in_areas(
         common: product of both renders' differences to the picture, at the LRHS's resolution.
         change: squared difference to the render that is put back, at this resolution.
         darker: the renders are darker than the picture.
-        scale, reach: as in :func:`trust_renders`.
     """
     most, largest = np.float32(LARGEST * scale**2), np.float32(LARGEST)
     energy, least = np.minimum(energy, most), np.minimum(noise, most)
@@ -154,22 +131,7 @@ def _trust_in_areas(
 
 
 def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple[Array, Array]:
-    """Return how much of a difference is detail by windows of ``cells`` LRHS pixels a cell and by larger ones.
-
-    - By the HRLS: a difference that is larger than noise explains. Windows that lack rare light lack the noise that it
-      makes, too. So one that is darker has the noise of all around.
-    - By both renders: their noise is independent, so the mean of the product of their differences to the picture is the
-      square of its error. Both agree that windows without rare light are dark. So a window that is darker also needs
-      brighter pixels on which they agree.
-
-    Args:
-        values: of each cell (h, w): energy, limited noise, common, change, common where it is not darker, squares of
-            energy and noise, squares of common, share that is darker, and noise.
-        levels: how many sizes of cells there are, from this one on.
-
-    Returns:
-        Trust (h, w) in [0, 1], and the noise of the largest windows.
-    """
+    """Return the trust (h, w) by windows of ``cells`` LRHS pixels a cell and larger ones, and the noise of these."""
     height, width = values[0].shape
     if levels > 1:
         larger = _trust_in_windows([halved(plane) for plane in values], levels - 1, 4 * cells)
@@ -178,6 +140,8 @@ def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple
         coarser, noise_around = np.zeros_like(values[0]), means_around(values[-1], [WINDOW])[0]
     means = two_at_a_time(lambda plane: means_around(plane, [WINDOW])[0], values[:-1])
     energy, noise, common, change, lit, squares, squares_of_both, darker = means
+    # Windows that lack rare light lack its noise, too, and both renders agree that they are dark. So a darker one has
+    # the noise of all around, and also needs brighter pixels on which the renders agree.
     dark, count = darker > MOSTLY, cells * (2 * WINDOW + 1) ** 2
     noise = np.where(dark, np.maximum(noise, noise_around), noise)
     least = np.where(dark, np.minimum(common, lit), common)
@@ -191,10 +155,7 @@ def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple
 def _trust_in_points(
     energy: Array, noise: Array, common: Array, change: Array, darker: Mask, scale: int, reach: int
 ) -> Array:
-    """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1].
-
-    The arguments are those of :func:`_trust_in_areas`.
-    """
+    """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1]; see :func:`_trust_in_areas`."""
     size, zero = min(AROUND, reach // 2), np.float32(0)
     is_point = change > np.float32(POINT)
     light, brighter = np.where(darker, zero, energy), np.where(is_point & ~darker, change, zero)
@@ -213,21 +174,12 @@ def _trust_in_points(
 
 
 def _levels(window: int, reach: int) -> int:
-    """Return how many levels depend on pixels within ``reach``, if windows reach ``window`` pixels on the first one.
-
-    A level averages twice over its windows, which are twice as large on the next one.
-    """
+    """Return how many levels see pixels within ``reach``: each averages twice over windows of twice the size."""
     return max(1, (reach // (2 * window)).bit_length())
 
 
 def _certainty(excess: Array, squares: Array, count: int) -> Array:
-    """Return how certain it is that the mean of a window exceeds 0: 0 up to ``DOUBTFUL``, 1 from ``CERTAIN`` on.
-
-    Args:
-        excess: the mean.
-        squares: the mean of the values' squares.
-        count: values in the window.
-    """
+    """Return how certain the mean of ``count`` values exceeds 0, from 0 to 1, given the mean of their squares."""
     error = np.sqrt(np.maximum(squares, 0) / np.float32(count))
     t = excess / np.maximum(error, np.float32(1e-12))
     return np.clip((t - DOUBTFUL) / (CERTAIN - DOUBTFUL), 0, 1)
@@ -243,34 +195,8 @@ def _brightness(mean: Array) -> Array:
     return blurred(mean, 2) + np.float32(DARKEST)
 
 
-def _squared_noise(lrhs: Array, mean: Array) -> Array:
-    """Return the squared difference of the renders (h, w), and of the rounding of both to half floats."""
-    return np.square(lrhs - mean) + np.float32(2 * ROUNDING**2) * np.square(np.maximum(lrhs, mean))
-
-
-def _blend(picture: Array, render: Array, trust: Array, points: Array) -> None:
-    """Add a part of its difference to a render to a picture, planes (c, s*h, s*w).
-
-    The part is ``trust`` (h, w), interpolated, and at least ``points`` (h, w) over a whole LRHS pixel.
-    """
-    (height, width), scale = render.shape[1:], render.shape[1] // len(trust)
-
-    def work(rows: slice) -> None:
-        place = slice(rows.start // scale, rows.stop // scale)
-        weight = upsample_linear(trust, scale, place)
-        np.maximum(weight, points[place].repeat(scale, axis=0).repeat(scale, axis=1), out=weight)
-        for plane, pixels in zip(picture[:, rows], render[:, rows], strict=True):
-            plane += weight * (pixels - plane)
-
-    for_row_blocks(work, height, width, multiple=scale)
-
-
 def _light_factor(own: Array, lrhs: Array, mean: Array, share: float, scale: int, reach: int) -> Array:
-    """Return the factor (h, w) that gives a picture the light of both renders where they agree that it differs.
-
-    The differences of the renders to the picture's ``own`` means are divided into levels of resolution, and each is
-    shrunk by its own evidence: the light of large areas is known best. The picture is multiplied, so its detail stays.
-    """
+    """Return the factor (h, w) that gives a picture the light of both renders where they agree that it differs."""
     brightness = _brightness(own)
     low, high = (lrhs - own) / brightness, (mean - own) / brightness
     # Chosen by the other render, or rare light would lose the samples that both have found.
@@ -287,10 +213,7 @@ def _light_factor(own: Array, lrhs: Array, mean: Array, share: float, scale: int
 
 
 def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:
-    """Return what two noisy differences (h, w) agree on, level by level (a Laplacian pyramid).
-
-    Their noise is independent, so the mean of their product is the square of what they share.
-    """
+    """Return what two noisy differences (h, w) agree on, level by level (a Laplacian pyramid)."""
     height, width = low.shape
     coarser = np.zeros_like(low)
     if levels > 1 and min(height, width) >= 8:

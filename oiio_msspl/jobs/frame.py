@@ -25,7 +25,7 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
-from oiio_msspl.fusion.passes.layers import is_large, layer_names, lrhs_names, pass_features, with_light
+from oiio_msspl.fusion.passes.layers import is_large, pass_features
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array, Mask, kept
 from oiio_msspl.jobs.inputs import MappedPair, files_by_name, find_views, map_pair
@@ -156,11 +156,9 @@ class ShotFrame:
             InputError: pixels can't be decoded.
         """
         if self.renders.hr is self.stored[1] and not is_large(self.hr):
-            sets = sets_to_fuse(self.hr, self.write)
-            high = with_light(self.hr, layer_names(sets))
-            pair = [high] if self.lr is self.hr else [with_light(self.lr, lrhs_names(self.lr, sets)), high]
-            loaded = [render.load([*render.features, "alpha"]) for render in pair]
-            self.renders = RenderPair(loaded[0], loaded[-1])
+            low, high = pass_features(self.lr, self.hr, sets_to_fuse(self.hr, self.write))
+            loaded = high.load([*high.features, "alpha"])
+            self.renders = RenderPair(loaded if low is high else low.load([*low.features, "alpha"]), loaded)
         return self.renders
 
 
@@ -217,7 +215,8 @@ def _set_pair(frame: ShotFrame, lr: MappedRender, hr: MappedRender, settings: Se
     frame.lr, frame.hr, frame.write = lr, hr, settings.write
     if frame.view is not None:  # layers about the fused picture are those of the first view
         frame.write = replace(settings.write, error_layer=False, trust_layer=False, data_passes=False, pixel_type=None)
-    sets = sets_to_fuse(hr, frame.write) if frame.plan.reach.renders else []
+    # Coarser layers are sums of averages.
+    sets = [replace(layers, coarser=()) for layers in sets_to_fuse(hr, frame.write) if frame.plan.reach.renders]
     frame.stored = pass_features(lr, hr, sets) if sets else (lr, hr)
     frame.renders = RenderPair(*frame.stored)
 

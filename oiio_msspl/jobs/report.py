@@ -179,7 +179,7 @@ def report_on(
         trust=None if fused.trust is None else float(fused.trust.mean()),
         frames_counted=None if fused.frames is None else float(fused.frames.mean(dtype=np.float64)),
         network_seconds=fused.seconds,
-        fused_sets=fused.passes.sets if fused.passes else [],
+        fused_sets=[job.written for job in fused.passes.jobs] if fused.passes else [],
     )
 
 
@@ -218,11 +218,11 @@ def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[Finding]:
 def _passes(fused: FusedFrame) -> dict[str, str]:
     if fused.passes is None:
         return {}
-    texts = {additive.name: f"fused: {additive.layer_names}" for additive in fused.passes.sets}
-    for name, layers in fused.passes.hrls_alone.items():
-        texts[name] += f" ({layers} from the HRLS alone)"
-    for name, fraction in fused.passes.lacking.items():
-        texts[name] += f"; {fraction:.1%} of the beauty's light is in none of them"
+    texts = {}
+    for job in fused.passes.jobs:
+        alone = f" ({job.hrls_alone} from the HRLS alone)" if job.hrls_alone else ""
+        lacking = f"; {job.lacking:.1%} of the beauty's light is in none of them" if job.remainder else ""
+        texts[job.layers.name] = f"fused: {job.written.layer_names}{alone}{lacking}"
     refused = {name: f"passed on: {reason}" for name, reason in fused.passes.refused.items() if name not in texts}
     return texts | refused
 

@@ -34,7 +34,6 @@ from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes
 from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import is_large
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.fusion.tiles.tiling import require_memory, strips_memory
 from oiio_msspl.image.arrays import HALF_MAX, kept
 from oiio_msspl.image.parallel import limit_threads
@@ -264,17 +263,16 @@ class ShotRun:
         sets = sets_to_fuse(frame.hr, frame.write)
         if not sets:
             return
-        session, beauty, renders = frame.session, picture.rgb, (frame.renders.lr, frame.renders.hr)
+        session, beauty, renders = frame.session, picture, (frame.renders.lr, frame.renders.hr)
         session.release_memory()  # for the passes
-        if stored_type(frame.hr.beauty_channels, frame.write) == "half" and beauty.dtype != np.float16:
+        if stored_type(frame.hr.beauty_channels, frame.write) == "half" and beauty.rgb.dtype != np.float16:
             # The passes sum to the beauty that is written.
-            beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
-        about = picture.alignment, sets, picture.clean_aovs
+            beauty = replace(picture, rgb=np.minimum(picture.rgb, np.float32(HALF_MAX)).astype(np.float16))
         with limit_threads(session.threads):
             picture.passes = fuse_passes(
-                PassInputs(frame.lr, frame.hr, beauty, *about, frame.means, renders),
+                PassInputs(frame.lr, frame.hr, beauty, sets, frame.means, renders),
                 picture.replaced,
-                fuse_layers=layer_fuser(session, picture),
+                session=session,
                 cache_bytes=strips_memory(self.settings.max_memory - frame.held_bytes, picture.nbytes),
                 progress=frame.progress,
             )

@@ -44,7 +44,6 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import layer_names, light_of
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.jobs.settings import family_for_noise
@@ -112,8 +111,7 @@ def methods(
     def ours(model: str, *, half: bool = False) -> Array:
         frame, session = fused[model]
         with patch("oiio_msspl.fusion.passes.network.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
-            inputs = PassInputs(lr, hr, frame.rgb, frame.alignment, [layers], frame.clean_aovs)
-            made = fuse_passes(inputs, fuse_layers=layer_fuser(session, frame))
+            made = fuse_passes(PassInputs(lr, hr, frame, [layers]), session=session)
         assert not made.refused
         height = hr.data_window.height
         planes = [[made.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]

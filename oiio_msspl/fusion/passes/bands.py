@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -20,11 +20,9 @@ from oiio_msspl.fusion.passes.lines import STEPS, BeautyFit, downsampled, smooth
 from oiio_msspl.fusion.passes.plan import PassJob
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
+from oiio_msspl.fusion.tiles.network import FusedPixels
 from oiio_msspl.image.arrays import Array, planes_of
 from oiio_msspl.image.filters import box_downsample, max_3x3
-
-#: Albedo and normal without noise, of half or float.
-Guides = Mapping[str, NDArray[Any]]
 
 #: HRLS rows that are fused at a time.
 BAND_ROWS = 128
@@ -44,20 +42,20 @@ class PassInputs:
     """The LRHS. Layers that it lacks are fused from the HRLS alone."""
     hr: MappedRender
     """The HRLS."""
-    rgb: Array
-    """The fused beauty, (height, width, 3), over the HRLS's data window."""
-    alignment: Alignment
-    """Of the pair."""
+    beauty: FusedPixels
+    """The fused beauty, and the HRLS's albedo and normal without noise, if there are some."""
     sets: Sequence[AdditiveSet]
     """Of the HRLS's ``additive_sets``. Those that do not sum to its beauty are refused."""
-    guides: Guides = field(default_factory=dict)
-    """Albedo and normal without noise, (height, width, 3) as the HRLS's; those that there are. Albedos above 1 are
-    taken from the HRLS."""
     averaged: tuple[Render, Render] | None = None
     """LRHS and HRLS with the features of :func:`oiio_msspl.fusion.passes.layers.pass_features`, averaged with those of
     other frames; None to read the files."""
     decoded: tuple[ReadableRender, ReadableRender] | None = None
     """LRHS and HRLS as the beauty was fused from them. If their light is in memory, it is not decoded again."""
+
+    @property
+    def alignment(self) -> Alignment:
+        """How the pair lies over each other."""
+        return self.beauty.alignment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +71,8 @@ class PassSources(PassInputs):
     @cached_property
     def dark(self) -> float:
         """Light that counts as equal to none in logarithms."""
-        lit = self.rgb[::4, ::4][self.rgb[::4, ::4] > 0]
+        some = self.beauty.rgb[::4, ::4]
+        lit = some[some > 0]
         return DARK * float(np.median(lit)) if lit.size else 1.0
 
     def planes(self, image: NDArray[Any], area: Window) -> Array:
@@ -109,7 +108,7 @@ class Band:
         """The core's rows in the area."""
         self.hrls_core, self._hrls_area = (in_hrls_pixels(window, self.scale) for window in (core, self.area))
         self._hrls_rows = self.hrls_core.slices(self._hrls_area)[0]
-        self._beauty = sources.planes(sources.rgb, self._hrls_area)
+        self._beauty = sources.planes(sources.beauty.rgb, self._hrls_area)
         self.low_beauty = downsampled(self._beauty, self.scale)
         """The fused beauty (3, h, w) over the area, at the LRHS's resolution."""
         self.to_fit = [job for job in jobs if job.remainder or self._has_light(job, full_size)]
@@ -169,15 +168,15 @@ class Band:
             not is_black(self.sources.low, name, low_area) for name in names if name in job.lrhs
         )
 
-    def _compared(self, images: Guides) -> Array:
+    def _compared(self, images: Mapping[str, Array]) -> Array:
         """Return planes by which pixels are compared, given albedo and normal (h, w, 3) of the HRLS."""
         log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + self.sources.dark)
         planes = [log[None] / SPREAD[RGB]]
         for name, image in images.items():
             noisy = planes_of(image)
             guide = smoothed(noisy, log)
-            if name in self.sources.guides:
-                clean = self.sources.planes(self.sources.guides[name], self._hrls_area)
+            if name in self.sources.beauty.clean_aovs:
+                clean = self.sources.planes(self.sources.beauty.clean_aovs[name], self._hrls_area)
                 # Some renderers write the colour of an emitter as its albedo, and tell lamps apart by that.
                 guide = np.where((noisy > 1).any(axis=0), guide, clean)
             planes.append(guide / SPREAD[name])

@@ -160,7 +160,7 @@ class SharesAround:
         """Return the light of the layers in each of a row of squares, (columns, layers)."""
         sources, alignment = self._sources, self._sources.alignment
         hrls_area = in_hrls_pixels(area, alignment.scale)
-        beauty = downsampled(sources.planes(sources.rgb, hrls_area), alignment.scale)
+        beauty = downsampled(sources.planes(sources.beauty.rgb, hrls_area), alignment.scale)
         features = read_features(sources.high, hrls_area, alignment.hr_data_window, [RGB, *job.names.values()])
         low = {name: box_downsample(image, alignment.scale) for name, image in features.items()}
         layers = dimmed(job, low, beauty)

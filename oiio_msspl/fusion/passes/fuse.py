@@ -10,12 +10,12 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 
 import numpy as np
 
-from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
+from oiio_msspl.aovs.additive_sets import AdditiveLayer
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.findings import Finding
@@ -23,10 +23,11 @@ from oiio_msspl.fusion.passes.bands import Band, PassInputs, PassSources, band_w
 from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, doubts_of, make_exact
 from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, lrhs_names
 from oiio_msspl.fusion.passes.lines import STEPS
-from oiio_msspl.fusion.passes.network import LayerFuser, LayersByNetwork
+from oiio_msspl.fusion.passes.network import LayersByNetwork
 from oiio_msspl.fusion.passes.plan import PassJob, plan_passes
 from oiio_msspl.image.arrays import HALF_MAX, Array, unload
 from oiio_msspl.image.parallel import half_of_the_threads, in_parallel, one_ahead
+from oiio_msspl.model.session import Session
 
 #: What derived layers leave of the beauty counts as rounding below this share of it.
 ROUNDING = np.float32(5e-7)
@@ -38,17 +39,13 @@ LIGHT_SPREAD = 1.0
 class FusedPasses:
     """The fused layers of all sets."""
 
-    sets: list[AdditiveSet]
+    jobs: list[PassJob]
     """The sets that were fused."""
     pixels: ReplacedChannels
     """Their new pixels, over the HRLS's data window."""
-    refused: dict[str, str] = field(default_factory=dict)
+    refused: dict[str, str]
     """Why other sets were not fused, by name."""
-    hrls_alone: dict[str, str] = field(default_factory=dict)
-    """By name of a fused set: the layers that were read from the HRLS alone, see :attr:`PassJob.hrls_alone`."""
-    lacking: dict[str, float] = field(default_factory=dict)
-    """By name of a fused set: the share of the beauty's light that is in no layer, for those that lack some."""
-    warnings: list[Finding] = field(default_factory=list)
+    warnings: list[Finding]
     """Sentences on sets whose layers the LRHS lacks, or do not sum to its beauty, or were too bright for half."""
 
 
@@ -56,7 +53,7 @@ def fuse_passes(
     inputs: PassInputs,
     pixels: ReplacedChannels | None = None,
     *,
-    fuse_layers: LayerFuser | None = None,
+    session: Session | None = None,
     cache_bytes: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedPasses:
@@ -65,28 +62,21 @@ def fuse_passes(
     Args:
         inputs: the fused pair and the sets.
         pixels: where the fused layers go; None for a new store.
-        fuse_layers: the network that fuses single layers. Layers that it can't fuse are fitted, and all without one.
+        session: its network for layers fuses them, if it has one. Layers that it can't fuse are fitted.
         cache_bytes: memory for decoded rows that two bands need.
         progress: called with (steps done, steps in all).
 
     Raises:
         InputError: pixels can't be decoded.
     """
-    low, high = _read_light(inputs, by_network=fuse_layers is not None)
+    low, high = _read_light(inputs, by_network=session is not None and session.layers is not None)
     jobs, refused, warnings = plan_passes(low, high, inputs.sets)
     sources = _sources_of(inputs, low, high)
     in_order = sorted(jobs, key=lambda job: inputs.sets.index(job.layers))
-    fused = FusedPasses(
-        sets=[replace(job.layers, coarser=tuple(job.coarser)) for job in in_order],
-        pixels=ReplacedChannels() if pixels is None else pixels,
-        refused=refused,
-        hrls_alone={job.layers.name: job.hrls_alone for job in in_order if job.hrls_alone},
-        lacking={job.layers.name: job.lacking for job in in_order if job.remainder},
-        warnings=warnings,
-    )
+    fused = FusedPasses(in_order, ReplacedChannels() if pixels is None else pixels, refused, warnings)
     window = inputs.alignment.hr_data_window
     fused.pixels.add([channel for job in jobs for channel in job.channels], window.width, window.height)
-    network = LayersByNetwork(sources, jobs, fuse_layers)
+    network = LayersByNetwork(sources, jobs, session)
     bands = len(band_windows(inputs.alignment))
     # A layer for a network counts as much as a set. Without any set, all is done.
     steps, done = bands * sum(1 + network.count(job) for job in jobs) or 1, 0 if jobs else 1
@@ -164,7 +154,7 @@ def _read_bands(sources: PassSources, jobs: Sequence[PassJob], network: LayersBy
 
     for band in one_ahead(map(prepare, band_windows(sources.alignment) if jobs else ())):
         yield band
-        for image in sources.guides.values():
+        for image in sources.beauty.clean_aovs.values():
             unload(image)
         network.unload()
 

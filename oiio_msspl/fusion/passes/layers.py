@@ -110,14 +110,9 @@ def lrhs_names(lr: MappedRender, sets: Sequence[AdditiveSet]) -> dict[AdditiveLa
 
 
 def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[MappedRender, MappedRender]:
-    """Return LRHS and HRLS with the light of layers of additive sets, which the LRHS may lack, as further features."""
-    names = layer_names(sets)
-    light = {names[layer]: layer.formula for additive_set in sets for layer in additive_set.layers}
-    high = replace(hr, features=hr.features | light)
-    if lr is hr:
-        return high, high
-    light = {name: layer.formula for layer, name in lrhs_names(lr, sets).items()}
-    return replace(lr, features=lr.features | light), high
+    """Return LRHS and HRLS with the features of :func:`with_light` for additive sets; the LRHS may lack layers."""
+    high = with_light(hr, layer_names(sets))
+    return high if lr is hr else with_light(lr, lrhs_names(lr, sets)), high
 
 
 def is_black(render: ReadableRender, name: str, area: Window | None = None) -> bool:

@@ -6,7 +6,7 @@ That is more accurate than a fit, and takes a run of the network for each layer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -21,9 +21,11 @@ from oiio_msspl.fusion.passes.lines import downsampled
 from oiio_msspl.fusion.passes.plan import PassJob
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import in_hrls_pixels, mirrored
+from oiio_msspl.fusion.tiles.network import fuse_layers
 from oiio_msspl.image.arrays import Array, blank, planes_of, unload
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import for_row_blocks
+from oiio_msspl.model.session import Session
 
 #: More light groups than this are fused at half of the resolution at x2, in 0.4 of the time. Each lamp lights the same
 #: surfaces, so the beauty has their detail. Components have detail of their own.
@@ -33,16 +35,13 @@ HALF = 2
 #: Layers at half of the resolution have little noise, so fewer pixels are averaged than by ``lines.STEPS``.
 HALF_STEPS = (1,)
 
-#: Fuses layers, given both renders with a layer in place of the beauty, for each layer, and the alignment of these
-#: pairs: (height, width, 3) over the HRLS's data window. It takes the next pair in the background.
-LayerFuser = Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]]
-
 
 class LayersByNetwork:
     """The layers of a frame that a network fuses, at full or at half of the resolution; none without a network."""
 
-    def __init__(self, sources: PassSources, jobs: Sequence[PassJob], fuse: LayerFuser | None) -> None:
-        self._fuse, self._alignment = fuse if any(job.lrhs for job in jobs) else None, sources.alignment
+    def __init__(self, sources: PassSources, jobs: Sequence[PassJob], session: Session | None) -> None:
+        self._beauty, self._alignment = sources.beauty, sources.alignment
+        self._session = session if session and session.layers and any(job.lrhs for job in jobs) else None
         self._renders = cast(tuple[Render, Render], (sources.low, sources.high))
         self._is_one_render = sources.lr is sources.hr
         self.at_full_size: dict[AdditiveLayer, Array] = {}
@@ -51,11 +50,11 @@ class LayersByNetwork:
 
     def count(self, job: PassJob) -> int:
         """Return how many layers :meth:`fuse` yields."""
-        return len(job.estimated) if self._fuse else 0
+        return len(job.estimated) if self._session else 0
 
     def fuse(self, job: PassJob) -> Iterator[AdditiveLayer]:
         """Fuse the layers of a set that have light in both renders. Yield each estimated one, fused or not."""
-        if self._fuse is None:
+        if self._session is None:
             return
         lit = {layer: job.names[layer] for layer in job.estimated if job.names[layer] in job.lrhs}
         lit = {layer: name for layer, name in lit.items() if not any(is_black(x, name) for x in self._renders)}
@@ -64,7 +63,7 @@ class LayersByNetwork:
         half = alignment.scale == HALF and job.layers.name == LIGHT_GROUPS and len(lit) > MOST_AT_FULL_SIZE
         if half:
             alignment = replace(alignment, scale=1, hr_data_window=alignment.grid)
-        fused = self._fuse(self._pairs(lit.values(), half=half), alignment)
+        fused = fuse_layers(self._session, self._beauty, self._pairs(lit.values(), half=half), alignment)
         for layer in job.estimated:
             if layer in lit:
                 light = next(fused)

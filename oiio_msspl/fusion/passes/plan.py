@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.passes.layers import LayerLight, same_layers
-from oiio_msspl.fusion.passes.sums import check_light, is_sum_of
+from oiio_msspl.fusion.passes.sums import check_light
 from oiio_msspl.image.parallel import in_parallel
 
 #: Layers, each with the layers that it is the sum of.
@@ -51,6 +51,11 @@ class PassJob:
         """Names of estimated layers that the LRHS lacks, or "all layers" if it has none; empty if it lacks none."""
         missing = [layer.name for layer in self.estimated if self.names[layer] not in self.lrhs]
         return "all layers" if missing and not self.lrhs else ", ".join(missing)
+
+    @property
+    def written(self) -> AdditiveSet:
+        """The set, with the coarser layers that are sums of its layers."""
+        return replace(self.layers, coarser=tuple(self.coarser))
 
     @property
     def channels(self) -> list[Channel]:
@@ -109,8 +114,12 @@ def _sums_of(high: LayerLight, layers: Sequence[AdditiveLayer], finer: AdditiveS
         parts = tuple(part for part in finer.layers if layer.words < part.words) if layer.words else ()
         if layer in finer.layers:
             parts = (layer,)
-        elif layer.factor is not None or len(parts) < 2 or not is_sum_of(high, layer, parts):
+        elif layer.factor is not None or len(parts) < 2:
             continue
+        else:
+            check = check_light(high, AdditiveSet(layer.name, parts), layer)
+            if check.problem or check.remainder:
+                continue
         if used.isdisjoint(parts):
             sums[layer] = parts
             used.update(parts)

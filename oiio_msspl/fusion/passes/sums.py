@@ -75,9 +75,10 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
         total: what they should sum to; None for the beauty. Then the check also says which layers are too many.
     """
     layers = additive_set.layers
-    outside = [layer.name for layer in layers if not _in_beauty_window(light, layer)]
-    if outside:
-        return SumCheck(1.0, problem=f"{outside[0]} has another data window")
+    parts, window = light.file.file.parts, light.file.data_window
+    for layer in layers if total is None else (*layers, total):
+        if any(parts[channel.part].data_window != window for channel in layer.channels):
+            return SumCheck(1.0, problem=f"{layer.name} has another data window")
     sums, of_layers = np.zeros(4), np.zeros((len(layers), 5))
     for pixels, sought, rest, usable in _strips_of(light, layers, total):
         lacking = rest[usable]
@@ -109,14 +110,6 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
     superfluous = _superfluous(light, layers) if total is None else []
     advice = f"without {' and '.join(superfluous)} they would sum to it" if superfluous else "some layers overlap"
     return SumCheck(residual, problem=f"they have {surplus / whole:.1%} more light; {advice}")
-
-
-def is_sum_of(light: LayerLight, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:
-    """Return whether a layer over the beauty's data window is the sum of others, on some strips of rows."""
-    if not _in_beauty_window(light, layer):
-        return False
-    check = check_light(light, AdditiveSet(layer.name, tuple(parts)), layer)
-    return not check.problem and not check.remainder
 
 
 #: Some rows of a set, (h, w, 3): its layers, what they should sum to, what they lack of it, and usable values.
@@ -181,8 +174,3 @@ def _equal_pixels(pixels: Array) -> tuple[int, int]:
             result[1:] |= same
             result[:-1] |= same
     return int(np.count_nonzero(equal & lit)), int(np.count_nonzero(lit))
-
-
-def _in_beauty_window(light: LayerLight, layer: AdditiveLayer) -> bool:
-    parts, window = light.file.file.parts, light.file.data_window
-    return all(parts[channel.part].data_window == window for channel in layer.channels)

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,14 +208,7 @@ def _run_network(tile: PreparedTile, session: Session, exposure: float, shares: 
     return images
 
 
-def layer_fuser(
-    session: Session, beauty: FusedPixels
-) -> Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]] | None:
-    """Return a function that fuses passes of a frame whose beauty ``session`` has fused; None if no network does."""
-    return None if session.layers is None else partial(_fuse_layers, session, beauty)
-
-
-def _fuse_layers(
+def fuse_layers(
     session: Session, beauty: FusedPixels, renders: Iterable[tuple[Render, Render]], alignment: Alignment
 ) -> Iterator[Array]:
     """Fuse passes of a frame, such as the light of each lamp.
@@ -224,6 +216,8 @@ def _fuse_layers(
     The caller limits the threads of NumPy, see :func:`oiio_msspl.image.parallel.limit_threads`.
 
     Args:
+        session: has a model for layers.
+        beauty: fused by it.
         renders: LRHS and HRLS with a pass in place of the beauty, for each pass. The next two are taken in the
             background while the network works.
         alignment: of the renders.

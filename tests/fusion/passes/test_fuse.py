@@ -18,7 +18,7 @@ from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.sums import check_sum
 from oiio_msspl.fusion.tiles import tiling
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.network import layer_fuser
+from oiio_msspl.fusion.tiles.network import FusedPixels
 from oiio_msspl.fusion.tiles.prepare import FramePair
 from oiio_msspl.image import arrays
 from oiio_msspl.jobs import settings
@@ -88,6 +88,13 @@ def fused(pair, out, model, passes=(), sums=(), layout="spec", **options):
     return report, {name: pixels for _, part in read_bits(out) for name, pixels in part.items()}
 
 
+def fuse_layers_of(low, high, beauty, aovs=None, **options):
+    """Fuse all sets of a pair, given its fused beauty: pixels (h, w, 3), or a fused frame."""
+    if isinstance(beauty, np.ndarray):
+        beauty = FusedPixels(beauty, None, None, align(low, high), 1.0, clean_aovs=aovs or {})
+    return fuse_passes(PassInputs(low, high, beauty, high.additive_sets), **options)
+
+
 def layer(channels, name=""):
     prefix = f"{name}." if name else ""
     return np.stack([channels[f"{prefix}{c}"] for c in "RGB"], axis=-1).astype(np.float64)
@@ -135,8 +142,8 @@ def test_an_albedo_without_noise_sharpens_components(tmp_path):
     errors = []
     for guides in ({}, {"albedo": albedo.astype(np.float16)}):
         beauty = sum(clean.values()).astype(np.float32)
-        result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets, guides))
-        found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.sets[0].layers[0].channels], axis=-1)
+        result = fuse_layers_of(low, high, beauty, guides)
+        found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.jobs[0].layers.layers[0].channels], axis=-1)
         errors.append(np.abs(found - clean["light_a"]).mean())
     assert errors[1] < 0.5 * errors[0]
 
@@ -149,8 +156,8 @@ def test_a_beauty_of_halves_is_fitted_in_32_bits(tmp_path):
     half = sum(clean.values()).astype(np.float16)
     found = []
     for beauty in (half, half.astype(np.float32)):
-        result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets))
-        channels = [c for layer in result.sets[0].layers for c in layer.channels]
+        result = fuse_layers_of(low, high, beauty)
+        channels = [c for layer in result.jobs[0].layers.layers for c in layer.channels]
         found.append(np.stack([result.pixels.get(channel, 0, HEIGHT) for channel in channels]))
     np.testing.assert_array_equal(*found)
 
@@ -165,8 +172,8 @@ def test_lamps_are_told_apart_by_albedos_above_1(tmp_path):
     guides = {"albedo": np.ones_like(beauty)}
     errors = []
     for given in ({}, guides):
-        result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets, given))
-        found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.sets[0].layers[0].channels], axis=-1)
+        result = fuse_layers_of(low, high, beauty, given)
+        found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.jobs[0].layers.layers[0].channels], axis=-1)
         errors.append(np.abs(found - clean["light_a"]).mean())
     assert errors[1] == errors[0]
 
@@ -182,13 +189,9 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
     session = load_model(4, "best", threads=1)
     beauty = fuse(*pair, session)
     found, steps = [], []
-    for fuser in (None, layer_fuser(session, beauty)):
-        result = fuse_passes(
-            PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets),
-            fuse_layers=fuser,
-            progress=lambda *told: steps.append(told),
-        )
-        channels = result.sets[0].layers[0].channels
+    for of_layers in (None, session):
+        result = fuse_layers_of(*pair, beauty, session=of_layers, progress=lambda *told: steps.append(told))
+        channels = result.jobs[0].layers.layers[0].channels
         found.append(np.stack([result.pixels.get(c, 0, HEIGHT) for c in channels], axis=-1))
         done, count = steps[-1]
         assert done == count > 0
@@ -218,12 +221,11 @@ def test_many_light_groups_are_fused_at_half_of_the_resolution_at_x2(tmp_path, s
     pair = [map_render(open_exr(file)) for file in files]
     session = load_model(scale, "best", threads=1)
     beauty, errors = fuse(*pair, session, clean_aovs=True), []
-    for fuser in (None, layer_fuser(session, beauty)):
-        inputs = PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets, beauty.clean_aovs)
-        result = fuse_passes(inputs, fuse_layers=fuser)
+    for of_layers in (None, session):
+        result = fuse_layers_of(*pair, beauty, session=of_layers)
         found = {
             each.name: np.stack([result.pixels.get(c, 0, HEIGHT) for c in each.channels], axis=-1)
-            for each in result.sets[0].layers
+            for each in result.jobs[0].layers.layers
         }
         assert_sum([each.astype(np.float64) for each in found.values()], beauty.rgb.astype(np.float64))
         errors.append(np.mean([np.abs(found[name] - clean[name]).mean() for name in clean]))
@@ -245,8 +247,8 @@ def test_a_lamp_with_few_samples_leaves_no_dark_specks(tmp_path):
         files.append(write_exr(tmp_path / f"{name}.exr", channels))
     low, high = (map_render(open_exr(file)) for file in files)
     beauty = np.full((HEIGHT, WIDTH, 3), 0.6, np.float32)
-    result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets))
-    found = result.pixels.get(result.sets[0].layers[1].channels[0], 0, HEIGHT)
+    result = fuse_layers_of(low, high, beauty)
+    found = result.pixels.get(result.jobs[0].layers.layers[1].channels[0], 0, HEIGHT)
     assert found[8:-8, 8:-8].min() > 0.1 * np.median(found)  # a corner has few samples around
 
 
@@ -265,8 +267,8 @@ def test_where_no_layer_has_a_sample_the_beauty_is_divided_as_around(tmp_path, m
         write_exr(tmp_path / f"{name}.exr", channels)
     lr, hr = (map_render(open_exr(tmp_path / f"{name}.exr")) for name in ("lr", "hr"))
     beauty = np.full((384, 128, 3), 0.8, np.float32)
-    result = fuse_passes(PassInputs(lr, hr, beauty, align(lr, hr), hr.additive_sets))
-    for each in result.sets[0].layers:
+    result = fuse_layers_of(lr, hr, beauty)
+    for each in result.jobs[0].layers.layers:
         found = result.pixels.get(each.channels[0], 0, 384)
         np.testing.assert_allclose(found, parts[each.name], rtol=1e-3, err_msg=each.name)
 
@@ -286,8 +288,8 @@ def test_bands_of_rows_agree(tmp_path, monkeypatch, samples):
     for rows in (128, 32):
         monkeypatch.setattr(bands, "BAND_ROWS", rows)
         beauty = np.full((320, 64, 3), samples, np.float32)
-        result = fuse_passes(PassInputs(lr, hr, beauty, align(lr, hr), hr.additive_sets))
-        found.append([result.pixels.get(each.channels[0], 0, 320) for each in result.sets[0].layers])
+        result = fuse_layers_of(lr, hr, beauty)
+        found.append([result.pixels.get(each.channels[0], 0, 320) for each in result.jobs[0].layers.layers])
         np.testing.assert_allclose(sum(found[-1]), samples, rtol=1e-5)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3)
 
@@ -309,10 +311,8 @@ def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_
     for whole in (False, True):
         if whole:
             monkeypatch.setattr(FramePair, "_lit_part", lambda *_: None)
-        fuser = layer_fuser(session, beauty)
-        inputs = PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets)
-        result = fuse_passes(inputs, fuse_layers=fuser)
-        channels = result.sets[0].layers[1].channels
+        result = fuse_layers_of(*pair, beauty, session=session)
+        channels = result.jobs[0].layers.layers[1].channels
         found.append(np.stack([result.pixels.get(c, 0, HEIGHT) for c in channels], axis=-1))
     assert sizes[0] == sizes[2] == sizes[3] == 2 * sizes[1]
     assert np.abs(found[0] - found[1]).max() < 0.05
@@ -528,8 +528,8 @@ def test_hardly_any_light_in_all_layers_stays_finite(tmp_path):
     dark = np.full((HEIGHT, WIDTH, 3), 1e-41, np.float32)
     low, high = (map_render(open_exr(file)) for file in write_pair(tmp_path, {"light_a": dark, "light_b": dark}))
     beauty = np.full((HEIGHT, WIDTH, 3), 0.1, np.float32)
-    result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets))
-    channels = [each.channels[0] for each in result.sets[0].layers]
+    result = fuse_layers_of(low, high, beauty)
+    channels = [each.channels[0] for each in result.jobs[0].layers.layers]
     total = sum(result.pixels.get(channel, 0, HEIGHT) for channel in channels)
     np.testing.assert_allclose(total, 0.1, rtol=1e-5)
 
@@ -721,8 +721,7 @@ def test_each_row_of_the_layers_is_decoded_once(tmp_path, monkeypatch, by_networ
         return decode(file, part, first, last, *others)
 
     monkeypatch.setattr(ExrFile, "_decode", count)
-    inputs = PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets)
-    fuse_passes(inputs, fuse_layers=layer_fuser(session, beauty) if by_network else None)
+    fuse_layers_of(*pair, beauty, session=session if by_network else None)
     for render in pair:
         assert sorted(rows[render.file.path]) == list(range(render.data_window.height))
 
@@ -894,7 +893,7 @@ def test_an_lrhs_with_a_wide_filter_does_not_blur_small_lamps(tmp_path):
     errors = {}
     for low in ("narrow", "wide"):
         lr, hr = maps[low], maps["hr"]
-        result = fuse_passes(PassInputs(lr, hr, beauty, align(lr, hr), hr.additive_sets)).pixels
+        result = fuse_layers_of(lr, hr, beauty).pixels
         channels = {c.name: c for part in hr.file.parts for c in part.channels}
         made = np.stack([result.get(channels[f"light_lamps.{c}"], 0, len(lamps)) for c in "RGB"], axis=-1)
         errors[low] = np.sqrt(np.mean((made - lamps) ** 2))

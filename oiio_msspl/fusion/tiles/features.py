@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -124,10 +125,7 @@ def read_tile(
 
 
 def _failed_buckets(low: Array, high: Array, scale: int) -> tuple[Mask, Mask] | None:
-    """Return the LRHS pixels (h, w) in buckets that failed, of the LRHS and of the HRLS; None if there are none.
-
-    One render is dead in a whole square, and hardly a pixel of the other render is.
-    """
+    """Return :attr:`TileFeatures.failed`: one render is dead in a whole square, and hardly a pixel of the other is."""
     dead_low, dead_high = _is_dead(low), _is_dead(high)
     if not dead_low.any() and not dead_high.any():
         return None
@@ -154,10 +152,7 @@ def _infinite(rgb: Array) -> Mask:
 
 
 def _as_bright(rgb: Array) -> Mask:
-    """Return where the 3 x 3 pixels of one render (h, w, 3) confirm an infinite pixel of the other render.
-
-    A lamp that overflows half floats is bright in both renders. A sample or a bucket that failed is not.
-    """
+    """Return where the 3 x 3 pixels of one render (h, w, 3) confirm an infinite pixel of the other as a lamp."""
     return max_3x3(rgb).max(axis=-1) >= HALF_MAX / FIREFLY_FACTOR
 
 
@@ -172,10 +167,9 @@ def read_lrhs(
 ) -> dict[str, Array]:
     """Read features of the LRHS over ``grid``. Features that it lacks are left out.
 
-    Each grid pixel gets the LRHS pixel that is nearest to the mean position of its HRLS pixels. If an odd size was
-    rounded, that is off by half an LRHS pixel at most. Interpolation would be exact, but neighbouring pixels would
-    share their noise, and networks take such noise for texture. Beyond the last whole LRHS pixel, where the HRLS
-    is mirrored, the LRHS is interpolated.
+    Each grid pixel gets the LRHS pixel that is nearest to the mean position of its HRLS pixels: half an LRHS pixel off
+    at most, if an odd size was rounded. Interpolated neighbours would share their noise, and networks take such noise
+    for texture. The LRHS is interpolated only where the HRLS is mirrored.
 
     Args:
         counts: gets the numbers of repaired values.
@@ -192,10 +186,7 @@ def read_lrhs(
 
 
 def _lrhs_positions(hrls_pixels: Indices, scale: int, stretch: float, exact: bool) -> NDArray[np.float64]:
-    """Return the mean position of every ``scale`` HRLS pixels, in LRHS pixels.
-
-    Unless ``exact``, positions of pixels that are not mirrored are rounded.
-    """
+    """Return the mean position of every ``scale`` HRLS pixels, in LRHS pixels; rounded unless mirrored or ``exact``."""
     groups = hrls_pixels.reshape(-1, scale)
     positions = (groups.mean(axis=1) + 0.5) / scale * stretch - 0.5
     in_place = (groups[:, 0] % scale == 0) & (groups[:, -1] - groups[:, 0] == scale - 1)
@@ -254,17 +245,12 @@ def _at(values: NDArray[T], rows: Indices, columns: Indices) -> NDArray[T]:
     for axis, indices in enumerate((rows, columns)):
         lines = values.swapaxes(0, axis)
         # Nearly all lines follow each other. Copying these together is faster than taking each one.
-        starts = np.flatnonzero(np.diff(indices, prepend=indices[0] - 2) != 1)
-        lengths = np.diff(starts, append=len(indices))
-        start, length = starts[lengths.argmax()], lengths.max()
-        run = slice(indices[start], indices[start] + length)
-        if length == len(indices):
-            values = lines[run].swapaxes(0, axis)
-            continue
-        chosen = np.empty_like(lines, shape=(len(indices), *lines.shape[1:]))
-        chosen[start : start + length] = lines[run]
-        for part in (slice(0, start), slice(start + length, None)):
-            chosen[part] = lines[indices[part]]
+        breaks = np.flatnonzero(np.diff(indices) != 1) + 1
+        chosen = lines[indices[0] : indices[-1] + 1]
+        if breaks.size:
+            chosen = np.empty_like(lines, shape=(len(indices), *lines.shape[1:]))
+            for start, stop in itertools.pairwise([0, *breaks, len(indices)]):
+                chosen[start:stop] = lines[indices[start] : indices[start] + stop - start]
         values = chosen.swapaxes(0, axis)
     return values
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Guards around the network.
-
-Fireflies are dimmed, lights keep their brightness, empty regions stay empty, and tiles without noise skip the network.
-"""
+"""Guards around the network: it gets no fireflies, lights keep their brightness, and empty regions stay empty."""
 
 from __future__ import annotations
 
@@ -23,8 +20,7 @@ from oiio_msspl.model.session import Session
 
 T = TypeVar("T", bound=np.generic)
 
-#: LRHS pixels on a side of the squares in which rare light is looked for, and the largest fraction of their pixels that
-#: it reaches. Light that reaches more is a surface or a lamp.
+#: LRHS pixels on a side of the squares in which rare light is looked for, and the most of their pixels that it reaches.
 _SQUARE, _RARE = 8, 0.25
 #: A tile has no noise if its renders differ nowhere by more than this, log-encoded: half a code of an 8-bit picture.
 NOISE_FREE = 1 / 512
@@ -50,11 +46,7 @@ SMEAR = 8
 
 
 def dim_fireflies(tile: TileFeatures) -> tuple[Array, dict[str, Array]]:
-    """Limit the brightness of each render by the other one.
-
-    Returns:
-        The LRHS's colour (h, w, 3), and the HRLS's features, both with limited radiance.
-    """
+    """Limit each render's radiance by the other: return the LRHS's colour (h, w, 3), and the HRLS's features."""
     lrhs_rgb, hrls = tile.lrhs[RGB], tile.hrls
     lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], tile.scale), tile)
     limit = _over_hrls(_brightness_limit(lrhs_rgb, tile))
@@ -75,10 +67,7 @@ def without_pure_colours(rgb: Array, exposure: float) -> Array:
 def with_pure_colours(fused: Array, rgb: Array, mixed: Array, exposure: float) -> Array:
     """Return a fused picture (h, w, 3) without the light that :func:`without_pure_colours` has added.
 
-    Args:
-        fused: what the network made of ``mixed``.
-        rgb, mixed: the HRLS, and its colour in which no bright pixel lacks a channel.
-        exposure: of the frame.
+    The network has made it of ``mixed``, the colour ``rgb`` of the HRLS with this light.
     """
     if mixed is rgb:
         return fused
@@ -105,7 +94,7 @@ def _by_lrhs_pixel(hrls: Array, scale: int) -> Array:
 
 
 def _over_hrls(lrhs: Array) -> Array:
-    """Return LRHS pixels (h, w, c) for :func:`_by_lrhs_pixel`, (h, 1, w, 1, c): results then have its memory layout."""
+    """Return LRHS pixels (h, w, c) as (h, 1, w, 1, c), in the memory layout of :func:`_by_lrhs_pixel`."""
     return np.moveaxis(planes_of(lrhs), 0, -1)[:, None, :, None]
 
 
@@ -124,13 +113,12 @@ def _brightest(rgb: Array) -> Array:
 def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | None:
     """Return the colour of pixels with radiance above ``LIGHT`` divided by the exposure, where both renders have it.
 
-    Networks average log-encoded radiance, which is clipped for them. So a lamp of a few pixels would lose most of its
-    light, and its rim would be too bright. Instead, a lamp is as bright as in the HRLS, and at most as bright as the
-    brightest of the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter. The LRHS then
-    has more light than the clipped HRLS, and the difference is spread over the clipped pixels: evenly, or in the
-    proportions of the HRLS, whichever gives a pixel more. Pixel filters move light between neighbours, so the light is
-    counted over 3 x 3 LRHS pixels. A pixel that is more than twice as bright as the clipped pixels on average is a
-    firefly in a lamp. The light around it is spread evenly.
+    Networks average log-encoded radiance, which is clipped for them, so a lamp of a few pixels would lose most of its
+    light. Instead, a lamp is as bright as in the HRLS, and at most as bright as the brightest of the 3 x 3 LRHS pixels
+    around. If it is smaller than an LRHS pixel, the LRHS has more light than the clipped HRLS. The difference, over
+    3 x 3 LRHS pixels because filters move light, is spread over the clipped pixels: evenly, or in the proportions of
+    the HRLS, whichever gives a pixel more. Around a firefly in a lamp, a pixel more than twice as bright as the clipped
+    ones on average, it is spread evenly.
 
     Args:
         lrhs_rgb, hrls_rgb: (h, w, 3) and (s*h, s*w, 3), scene linear, without fireflies (:func:`dim_fireflies`).
@@ -186,26 +174,21 @@ def steady_lights(rgb: Array, exposure: float) -> Array | None:
 
 
 def _brightness_limit(rgb: Array, tile: TileFeatures) -> Array:
-    """Return the largest values that the other render may have, (h, w, 3): infinity where this render is black.
-
-    Where few samples find the light, all 3 x 3 pixels around may have missed it. So rare light counts, too, if it is in
-    most squares of pixels around. One sample of it may be s^2 times as bright as the mean of s x s samples.
-    """
+    """Return the largest values that the other render may have, (h, w, 3): infinity where this render is black."""
     brightest = max_3x3(rgb)
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
         limit = brightest * np.float32(FIREFLY_FACTOR)
+        # All 3 x 3 pixels around may have missed light that few samples find. One of s x s samples of it may be s^2
+        # times as bright as their mean.
         rare = _rare_light(rgb, tile.lrhs_area.y0 % _SQUARE, tile.lrhs_area.x0 % _SQUARE)
-        # In place, in the memory layout of the render.
         np.copyto(limit, rare * np.float32(tile.scale**2), where=rare > limit)
         np.copyto(limit, np.float32(np.inf), where=~(brightest > 0))
         return limit
 
 
 def _rare_light(rgb: Array, top: int, left: int) -> Array:
-    """Return the brightness of light that reaches a few pixels in most of the 3 x 3 squares around, (h, w, 3).
-
-    ``top`` rows and ``left`` columns of the first square lie before the tile, so that tiles have equal squares.
-    """
+    """Return the brightness of light that reaches a few pixels in most of the 3 x 3 squares around, (h, w, 3)."""
+    # So many rows and columns of the first square lie before the tile, so that tiles have equal squares.
     height, width, channels = rgb.shape
     rows, columns = (-(-side // _SQUARE) for side in (top + height, left + width))
     lines = np.zeros((channels, rows, _SQUARE, columns * _SQUARE), np.float32)
@@ -241,14 +224,12 @@ def check_finite(session: Session, *images: Array) -> None:
 class EmptyRegions:
     """The regions where neither render has light, and that become black, so that a transparent film stays empty.
 
-    A pixel is empty if it and the 3 x 3 LRHS pixels around are black, and no surface is near. A dark surface may have
-    no lit sample near, and a network spreads the light of a single sample far. So a pixel near a surface is empty only
-    if both renders are black over ``reach`` pixels around. Otherwise the result would have black holes.
+    A pixel is empty if it and the 3 x 3 LRHS pixels around are black, and no surface is near. Near a dark surface,
+    which may have no lit sample by chance, both renders must be black over ``reach`` pixels around.
 
-    In a pass, this also holds without a surface where light is rare. Few samples find a lamp that is out of focus, and
-    the others find the empty background behind it. If the pass of the lamp were black there, its light in the beauty
-    would go to other passes. In a beauty, rare light before an empty background is more often that of stars, and the
-    space between them stays black.
+    In a pass, the latter also holds where light is rare: few samples find a lamp that is out of focus, and the others
+    find the empty background behind it. In a beauty, such light is more often that of stars, and the space between them
+    stays black.
 
     Args:
         lrhs_rgb: the whole LRHS (h, w, 3).
@@ -289,10 +270,7 @@ def black_in_both(lrhs_rgb: Array, hrls_rgb: Array) -> Mask:
 
 
 def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
-    """Return the smallest rectangle around all lit pixels, ``margin`` pixels wider on each side; None if none is lit.
-
-    ``rgb``: (h, w, 3) over ``window``.
-    """
+    """Return the rectangle around all lit pixels (h, w, 3) of a window, and a margin; None if none is lit."""
     values = rgb.reshape(len(rgb), -1)  # NumPy is several times as fast along one axis as along two
     rows = np.flatnonzero(values.any(axis=1))
     if not rows.size:

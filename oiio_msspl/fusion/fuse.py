@@ -89,7 +89,7 @@ def fuse(
         trust: put back detail and light that both renders show, see
             :func:`oiio_msspl.fusion.tiles.trust.trust_renders`.
         clean_aovs: also keep the albedo and the normal that the model denoises, see :attr:`Session.clean_aovs`.
-        half: keep the result as half floats, in half the memory. Values above ``HALF_MAX`` are clipped.
+        half: keep the result as half floats; values above ``HALF_MAX`` are clipped.
         share: of the LRHS in the mean of both renders, in [0, 1]; None to find it by their noise.
         max_memory: bytes that the whole process should stay below. The result does not depend on it.
         held: bytes that the caller holds beside this frame.

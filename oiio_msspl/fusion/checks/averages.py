@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.checks.framing import AREA, central_slices
-from oiio_msspl.fusion.checks.same_noise import MIDDLE
+from oiio_msspl.fusion.checks.same_noise import MIDDLE, noise_variance
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import TileFeatures, in_hrls_pixels
 from oiio_msspl.image.arrays import Array, planes_of
@@ -92,7 +92,7 @@ class HrlsAverages:
         if NORMAL in pair.hrls:
             pixels = _hrls_pixels(pair, NORMAL, window)
             # Means over scale x scale pixels, in two differences of two of them each.
-            variance = reduce(np.add, planes_of(_noise_variance(pixels, pair.scale)))
+            variance = reduce(np.add, planes_of(noise_variance(pixels, pair.scale)))
             self.aovs[NOISE][target] = np.sqrt(variance) * np.float32(2 / pair.scale)
             mean = box_downsample(pixels, pair.scale)
             self.aovs[NORMAL][target] = _edge_lengths(mean)
@@ -120,7 +120,7 @@ class HrlsAverages:
             mean = box_downsample(samples, scale)
             averages[rows] = luminance(mean)
             pixels, grey = luminance(samples), luminance(colour)
-            expected = _noise_variance(pixels, scale) / np.float32(scale**2)
+            expected = noise_variance(pixels, scale) / np.float32(scale**2)
             # Black pixels are equal in any two renders where light is rare.
             noisy = (grey > 0) & (expected > np.square(np.float32(NOISY) * grey))
             equal, by_chance = (
@@ -146,18 +146,6 @@ def _edge_lengths(normal: Array) -> Array:
         squares[:-1] += np.square(np.diff(plane, axis=0))
         squares[:, :-1] += np.square(np.diff(plane, axis=1))
     return np.sqrt(squares)
-
-
-def _noise_variance(pixels: Array, scale: int) -> Array:
-    """Estimate the variance of noise (h, w, ...) of the HRLS's pixels (s*h, s*w, ...) from 2 x 2 pixels each."""
-    # Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
-    if scale == ONE_SIZE:  # each pixel, with those to the right and below
-        pixels = np.pad(pixels, [(0, 1), (0, 1), *[(0, 0)] * (pixels.ndim - 2)], mode="edge")
-        a, b, c, d = (pixels[i : len(pixels) - 1 + i, j : pixels.shape[1] - 1 + j] for i in (0, 1) for j in (0, 1))
-    else:
-        a, b, c, d = (pixels[i::2, j::2] for i in (0, 1) for j in (0, 1))
-    variance: Array = np.square(a - b - c + d) / np.float32(4)
-    return box_downsample(variance, scale // 2) if scale > 2 else variance
 
 
 def _hrls_pixels(pair: TileFeatures, feature: str, window: Window) -> Array:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks that albedo and normals belong to the picture: their edges then lie where the picture has edges.
 
-The strength of an AOV's edges in the picture is unknown: a dark corner hides them, and a mirror shows others. So the
-AOV is its own control. Its edges, shifted by some pixels, say how well edges fit by chance. Without a shift they must
-fit better than that, and no shift may fit clearly better.
+A dark corner hides edges, and a mirror shows others, so the AOV is its own control: shifted by some pixels, its edges
+fit by chance. Without a shift they must fit better than that, and no shift may fit clearly better.
 """
 
 from __future__ import annotations
@@ -146,11 +145,7 @@ class _Edges:
         return int(column) - IN_PLACE[1], int(row) - IN_PLACE[0]
 
     def repeat_in(self, picture: _Edges) -> bool:
-        """Return whether ``picture`` has a pattern of these edges that repeats, as boards or tiles do.
-
-        Shifted by a period, the pattern fits as well. But if both pictures have it, their correlation depends on the
-        shift as the correlation of the pattern with itself.
-        """
+        """Return whether a picture has a pattern of these edges, such as boards: both then correlate alike by shift."""
         auto, cross = (
             by_shift(np.conj(self.spectrum) * edges.spectrum, self.shape)[0].ravel() for edges in (self, picture)
         )
@@ -167,6 +162,6 @@ def _fit_signed(a: list[Array], b: list[Array]) -> float:
 
 
 def _above_control(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> Array:
-    """Return by how many standard deviations of the control two pictures fit better than it, for each shift."""
+    """Return by how many standard deviations two pictures fit better than the control, for each shift."""
     window, control = by_shift(spectrum, shape)
     return np.asarray((window - control.mean()) / max(float(control.std()), 1e-30))

@@ -2,10 +2,9 @@
 """Finds the shift and zoom of one picture against another, by least squares.
 
 The method is Lucas and Kanade 1981, coarse to fine: shift and zoom whose first-order effect on the LRHS explains the
-difference best. Two pictures of one frame may also differ by a tone curve, since noise changes the mean of
-display values, and by a blur, since pixel filters differ. Both are fitted along with shift and zoom, as a polynomial of
-the LRHS and its Laplacian. The gradients are those of the LRHS, so noise of the HRLS makes the estimate vary and does
-not bias it.
+difference best. A tone curve, since noise changes the mean of display values, and a blur, since pixel filters differ,
+are fitted along with them, as a polynomial of the LRHS and its Laplacian. The gradients are those of the LRHS, so noise
+of the HRLS does not bias the estimate.
 """
 
 from __future__ import annotations

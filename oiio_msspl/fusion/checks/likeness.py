@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tells how well two pictures of one frame should correlate, how well they do, and how well by chance.
 
-The expected correlation follows from the noise of both pictures. Each block of pixels is cut into two halves, whose
-noise is independent, so that the correlation of the halves is that of the picture without its noise.
-
-Fine structure has a control of its own: shifted or mirrored, a picture shows how well it fits by chance.
+The noise of two halves of a block is independent, so their correlation tells how well two noisy pictures should
+correlate. Fine structure has a control of its own: shifted or mirrored, a picture shows how well it fits by chance.
 """
 
 from __future__ import annotations

@@ -80,16 +80,14 @@ def _noise_in_blocks(lr: ReadableRender, hr: ReadableRender, alignment: Alignmen
 def _noise_by_difference(
     lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, of_mean: bool
 ) -> NDArray[np.float64]:
-    """Return the deviation (n) of an HRLS pixel's noise in blocks, by the difference of both renders.
-
-    For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. If ``of_mean``, an LRHS with less
-    noise than the HRLS makes it smaller: 2 (1 - share) is the variance of the mean of both, relative to equal shares.
-    """
+    """Return the deviation (n) of an HRLS pixel's noise in blocks, by the difference of both renders."""
     lows, highs = [], []
     for low, high, exposure in samples_of(lr, hr, alignment):
         lows.append(encode_radiance(low, exposure))
         highs.append(encode_radiance(box_downsample(high, alignment.scale), exposure))
     share = lrhs_share(np.stack(lows), np.stack(highs))
+    # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. That of the mean of both
+    # renders is 2 (1 - share), relative to equal shares.
     gain = alignment.scale * np.sqrt(share * (min(1.0, 2 * (1 - share)) if of_mean else 1.0))
     # All colours count alike: blue noise is hardly seen in luminance.
     squares = [np.square(low - high, dtype=np.float64).mean(axis=-1) for low, high in zip(lows, highs, strict=True)]

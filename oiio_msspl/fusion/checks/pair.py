@@ -316,12 +316,9 @@ def _is_typical(ratio: float, hrls: HrlsAverages) -> bool:
 
 
 def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
-    """Return the place (x, y), in LRHS pixels, where the pictures differ by more than noise; None if there is none.
-
-    Each block gets a paired t-test: the picture cancels out, and a single firefly has a t of about 1, however bright it
-    is. The mean of t^2 over neighbouring blocks is 1 for noise. A thing that moved exceeds it, and also the median of
-    the frame, which a difference of the whole frame raises.
-    """
+    """Return the place (x, y), in LRHS pixels, where the pictures differ by more than noise; None if there is none."""
+    # A paired t-test of each block: the picture cancels out, and a firefly has a t of about 1. The mean of t^2 over
+    # neighbouring blocks is 1 for noise. A difference of the whole frame raises the median, so that counts, too.
     floor = 0.05 * quantile((low + high).ravel(), 0.5)
     planes = low, high, np.square(low), np.square(low - high)
     for size, side, different in BLOCK_GROUPS:

@@ -8,12 +8,14 @@ leave is compared with the noise that such a sum has: an independent render diff
 from __future__ import annotations
 
 import operator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import blurred, box_downsample
+from oiio_msspl.model.contract import ONE_SIZE
 
 #: Side, in LRHS pixels, of the middle of the frame that is compared, and of the blocks in which noise is averaged.
 MIDDLE, BLOCK = 256, 4
@@ -35,15 +37,13 @@ _COUNTS = np.array([4, 8, 4, 8, 8, 4])
 def compare_noise(low: Array, quarters: Array) -> tuple[bool | None, bool]:
     """Compare the noise of both renders.
 
-    Texture without noise looks like noise that both share. So a second answer asks for more: the LRHS was made from the
-    HRLS only if nothing is left of it.
-
     Args:
         low: luminance of the LRHS (h, w).
         quarters: luminance of the HRLS over the quarters of LRHS pixels, (2h, 2w).
 
     Returns:
-        Whether the noise is the same, None if there is too little of it; and whether the LRHS is independent.
+        Whether the noise is the same, None if there is too little of it; and whether the LRHS is independent. Texture
+        without noise looks like shared noise, so it is independent unless nothing is left of the difference.
     """
     if min(low.shape) < 4 * BLOCK:
         return None, True
@@ -57,13 +57,11 @@ def compare_noise(low: Array, quarters: Array) -> tuple[bool | None, bool]:
     planes = (sums * weight).reshape(len(sums), -1)
     products = (planes * (picture * weight).ravel()).sum(axis=1)
     weights = np.linalg.lstsq(planes @ planes.T, products, rcond=None)[0]
-    a, b, c, d = (quarters[i::2, j::2][inner].astype(np.float64) for i in (0, 1) for j in (0, 1))
-    # Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
     residual, noise, light = (
         box_downsample(values, BLOCK).astype(np.float64)
         for values in (
             np.square(picture - sum(map(operator.mul, weights, sums))),
-            np.square(a - b - c + d) / 4,
+            noise_variance(quarters.astype(np.float64), 2)[inner],
             brightness,
         )
     )
@@ -76,6 +74,18 @@ def compare_noise(low: Array, quarters: Array) -> tuple[bool | None, bool]:
         for part, most in ((expected, SAME_NOISE), (np.square(light[noisy]), COPIED**2))
     )
     return same, not copied
+
+
+def noise_variance(pixels: NDArray[Any], scale: int) -> NDArray[Any]:
+    """Estimate the variance of noise (h, w, ...) of the HRLS's pixels (s*h, s*w, ...) from 2 x 2 pixels each."""
+    # Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
+    if scale == ONE_SIZE:  # each pixel, with those to the right and below
+        pixels = np.pad(pixels, [(0, 1), (0, 1), *[(0, 0)] * (pixels.ndim - 2)], mode="edge")
+        a, b, c, d = (pixels[i : len(pixels) - 1 + i, j : pixels.shape[1] - 1 + j] for i in (0, 1) for j in (0, 1))
+    else:
+        a, b, c, d = (pixels[i::2, j::2] for i in (0, 1) for j in (0, 1))
+    variance: NDArray[Any] = np.square(a - b - c + d) / np.float32(4)
+    return box_downsample(variance, scale // 2) if scale > 2 else variance
 
 
 def _sums(quarters: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -181,13 +181,7 @@ def _fuse_set(
 
 
 def _fit_to_beauty(band: Band, job: PassJob, renders: Sequence[Array], out: Array, missing: Sequence[int]) -> None:
-    """Fit the noisy means of a set's layers, in both renders, to the fused beauty.
-
-    Args:
-        renders: of :meth:`Band.renders_of`. The first one may be written over.
-        out: gets the layers, (layers, 3, h, w) over the core.
-        missing: which ones to fit. Black ones stay as they are.
-    """
+    """Fit the ``missing`` layers in ``out`` (layers, 3, h, w) to the fused beauty; changes ``renders``."""
     noisy, *lrhs = renders
     for layers in lrhs:
         weight = _likeness(band, layers)
@@ -201,11 +195,8 @@ def _fit_to_beauty(band: Band, job: PassJob, renders: Sequence[Array], out: Arra
 
 
 def _likeness(band: Band, layers: Array) -> Array:
-    """Return the weight (h, w) of the LRHS's layers (layers, 3, h, w): 1 where the fused beauty has as much light.
-
-    The pixel filter of the LRHS is wider. Small lights and highlights lose light to the pixels around them, and so do
-    their layers.
-    """
+    """Return the weight (h, w) of the LRHS's layers (layers, 3, h, w): 1 where the fused beauty has as much light."""
+    # The pixel filter of the LRHS is wider, so small lights and highlights lose light to the pixels around them.
     lights = (layers.sum(axis=(0, 1), dtype=np.float64), band.low_beauty.sum(axis=0, dtype=np.float64))
     rendered, fused = (np.log(light + 3 * band.sources.dark) for light in lights)
     return np.exp(-np.square((rendered - fused) / LIGHT_SPREAD)).astype(np.float32)

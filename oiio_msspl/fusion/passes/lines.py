@@ -77,8 +77,7 @@ def _kernel(guides: Array, step: int) -> Array:
 class LinesNearby:
     """Lines at full resolution: means of those of the four low-resolution pixels around that look alike.
 
-    All pixels that lie in the same place of a low-resolution pixel, a *phase*, are computed together. They are as many
-    as low-resolution pixels, so all arrays are contiguous.
+    All pixels in the same place of a low-resolution pixel, a *phase*, are computed together, in contiguous arrays.
     """
 
     def __init__(self, low: Array, full: Array, scale: int, rows: slice) -> None:
@@ -86,8 +85,7 @@ class LinesNearby:
         self._rows, self._scale = rows, scale
         height, width = rows.stop - rows.start, low.shape[2]
         positions = [(phase + 0.5) / scale - 0.5 for phase in range(scale)]
-        #: For each phase, the row or column of its first corner, in :meth:`_padded`, and the weights of both corners in
-        #: linear interpolation.
+        #: For each phase, the row or column of its first corner in :meth:`_padded`, and both corners' linear weights.
         self._corners = [int(position > 0) for position in positions]
         self._nearness = [(1 - x, x) for x in (position if position > 0 else 1 + position for position in positions)]
         #: For each phase, the weights of the two rows and two columns of corners.
@@ -146,10 +144,7 @@ class LinesNearby:
 
     def _padded(self, planes: Array) -> Array:
         """Return the chosen rows of planes (n, h, w), with one pixel more on each side; the edge is repeated."""
-        rows = slice(max(self._rows.start - 1, 0), self._rows.stop + 1)
-        top = 1 - (self._rows.start - rows.start)
-        bottom = max(self._rows.stop + 1 - planes.shape[1], 0)
-        return np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
+        return np.pad(planes, ((0, 0), (1, 1), (1, 1)), mode="edge")[:, self._rows.start : self._rows.stop + 2]
 
 
 def _between(first: Array, second: Array, weight: float) -> Array:

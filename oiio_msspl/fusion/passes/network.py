@@ -24,7 +24,6 @@ from oiio_msspl.fusion.tiles.features import in_hrls_pixels, mirrored
 from oiio_msspl.fusion.tiles.network import fuse_layers
 from oiio_msspl.image.arrays import Array, blank, planes_of, unload
 from oiio_msspl.image.filters import box_downsample
-from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.model.session import Session
 
 #: More light groups than this are fused at half of the resolution at x2, in 0.4 of the time. Each lamp lights the same
@@ -130,13 +129,7 @@ def _draw_towards(image: Array, means: Array) -> None:
     """Change a fitted layer (3, h, w), so that its means over 2 x 2 pixels are half-way to ``means``, the network's."""
     # A fit can't tell apart two lamps that are equally bright and a few pixels apart, so the light of one would leak
     # into the layer of the other. The network can, but its result has more noise. Half-way is the geometric mean.
-
-    def work(rows: slice) -> None:
-        part = image[:, rows]
-        wanted = means[:, rows.start // HALF : -(-rows.stop // HALF)]
-        fitted = downsampled(part, HALF)
-        factors = np.sqrt(wanted / np.maximum(fitted, np.float32(1e-6) * wanted + np.finfo(np.float32).tiny))
-        factors[fitted <= 0] = 1
-        part *= factors.repeat(HALF, axis=1).repeat(HALF, axis=2)
-
-    for_row_blocks(work, image.shape[1], image[:, 0].size, multiple=HALF)
+    fitted = downsampled(image, HALF)
+    factors = np.sqrt(means / np.maximum(fitted, np.float32(1e-6) * means + np.finfo(np.float32).tiny))
+    factors[fitted <= 0] = 1
+    image *= factors.repeat(HALF, axis=1).repeat(HALF, axis=2)

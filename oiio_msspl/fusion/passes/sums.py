@@ -112,10 +112,6 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
     return SumCheck(residual, problem=f"they have {surplus / whole:.1%} more light; {advice}")
 
 
-#: Some rows of a set, (h, w, 3): its layers, what they should sum to, what they lack of it, and usable values.
-_Strip = tuple[list[Array], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
-
-
 def _layer_sums(pixels: Array, usable: NDArray[np.bool_]) -> list[float]:
     """Return a layer's negative and its positive light, equal pixels, lit ones, and if a value is finite."""
     values = pixels[usable]
@@ -145,7 +141,8 @@ def _lossy_compression(render: MappedRender, layers: Sequence[AdditiveLayer]) ->
 
 def _strips_of(
     light: LayerLight, layers: Sequence[AdditiveLayer], total: AdditiveLayer | None = None
-) -> Iterator[_Strip]:
+) -> Iterator[tuple[list[Array], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]]:
+    """Yield rows of a set, (h, w, 3): its layers, what they should sum to, what they lack of it, and usable values."""
     window, names = light.file.data_window, [light.names[layer] for layer in layers]
     whole = RGB if total is None else light.names[total]
     channels: Sequence[Channel] = light.file.beauty_channels if total is None else total.channels

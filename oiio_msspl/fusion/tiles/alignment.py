@@ -32,9 +32,8 @@ class Alignment:
 def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
     """Find how the pixels of a pair lie over each other; of one render, which is given as both, or of two of one size.
 
-    An HRLS of odd size (1921 x 1081) may come with an LRHS that is rounded up or down (961 x 541 or 960 x 540).
-    Renderers fit the whole frame into either size, so an LRHS pixel is not exactly s HRLS pixels wide: ``stretch`` is
-    the ratio. The pixel aspects are equal, or differ by that ratio, so that both frames have one shape.
+    An HRLS of odd size (1921 x 1081) may come with an LRHS that is rounded up or down (961 x 541 or 960 x 540), whose
+    pixels are not exactly s HRLS pixels wide: ``stretch`` is the ratio. Pixel aspects may differ by it.
 
     Programs that crop a data window to what is not empty crop two noisy renders differently. So an LRHS that does not
     cover the HRLS's data window is black and transparent in the rest of the frame, as OpenEXR defines it.

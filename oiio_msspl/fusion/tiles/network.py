@@ -146,16 +146,12 @@ def _fuse_tile(task: TileTask, session: Session) -> None:
 
 
 def _fuse_alpha(tile: TileFeatures, session: Session, shares: Shares, *, trust: bool) -> Array:
-    """Fuse the alpha of a tile, (s*h, s*w, 1) in [0, 1], by the network as if it were a grey picture.
-
-    A pixel is exactly 1 or 0 if its LRHS pixel and the HRLS pixels around it are. A tile of such pixels only does not
-    reach the network. If the LRHS has no alpha, that of the HRLS is kept. With ``trust``, what both renders show is put
-    back, such as crisp edges (:func:`.trust_renders`).
-    """
+    """Fuse the alpha of a tile, (s*h, s*w, 1) in [0, 1], by the network as if it were a grey picture."""
     hrls_alpha = np.clip(tile.hrls["alpha"], 0.0, 1.0)
     if "alpha" not in tile.lrhs:
         return hrls_alpha
     lrhs_alpha = np.clip(tile.lrhs["alpha"], 0.0, 1.0)
+    # A pixel stays 0 or 1 if both renders have that value there and around it.
     exact = [repeated(lrhs_alpha == value, tile.scale) & (hrls_alpha == value) for value in (0, 1)]
     if (exact[0] | exact[1]).all():
         return exact[1].astype(np.float32)
@@ -212,8 +208,6 @@ def fuse_layers(
     session: Session, beauty: FusedPixels, renders: Iterable[tuple[Render, Render]], alignment: Alignment
 ) -> Iterator[Array]:
     """Fuse passes of a frame, such as the light of each lamp.
-
-    The caller limits the threads of NumPy, see :func:`oiio_msspl.image.parallel.limit_threads`.
 
     Args:
         session: has a model for layers.

@@ -79,8 +79,7 @@ class FramePair:
         self._is_one_render = lr is hr
         self.grid = aligned_grid(alignment.grid, contract.alignment)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
-        #: Features of the LRHS that are read tile by tile, because those of full size would take too much memory. One
-        #: render has them in the HRLS, except alpha.
+        #: Features of a full-size LRHS are read tile by tile, to save memory. One render has all but alpha in the HRLS.
         self._lrhs_by_tile = [*([] if lr is hr else contract.lrhs[1:]), "alpha"] if alignment.scale == ONE_SIZE else []
         whole = [name for name in (*contract.lrhs, "alpha") if name not in self._lrhs_by_tile]
         self._lrhs = read_lrhs(lr, alignment, self.grid, whole, self._lrhs_counts)

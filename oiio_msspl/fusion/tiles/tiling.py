@@ -46,10 +46,7 @@ class Tile:
 
 
 def aligned_grid(grid: Window, alignment: int) -> Window:
-    """Extend ``grid`` to the right and to the bottom until its sides are multiples of ``alignment``.
-
-    With that of a model's contract, a network takes the size.
-    """
+    """Extend a grid to the right and to the bottom until its sides are multiples of ``alignment``."""
     width, height = (-(-side // alignment) * alignment for side in (grid.width, grid.height))
     return Window(grid.x0, grid.y0, grid.x0 + width, grid.y0 + height)
 
@@ -57,9 +54,9 @@ def aligned_grid(grid: Window, alignment: int) -> Window:
 def plan_tiles(grid: Window, contract: Contract, part: Window | None = None) -> list[Tile]:
     """Cover ``grid`` by tiles of at most ``TILE_MEMORY``, row by row, so that the network computes the fewest pixels.
 
-    No tile reaches beyond the grid: the network sees the end of the picture there, as in training. The offsets of all
-    tiles are multiples of the contract's alignment, so that a network that works on blocks of pixels divides a tile as
-    it divides the frame. Only ``part`` of the grid is covered, if given; the tiles may exceed it.
+    No tile reaches beyond the grid: the network sees the end of the picture there, as in training. Offsets are
+    multiples of the contract's alignment, so a network divides a tile into blocks as it divides the frame. Only
+    ``part`` of the grid is covered, if given; the tiles may exceed it.
     """
     alignment = contract.alignment
     overlap = -(-contract.overlap // alignment) * alignment
@@ -89,10 +86,8 @@ def plan_tiles(grid: Window, contract: Contract, part: Window | None = None) -> 
 
 
 def sample_bands(grid: Window, scale: int) -> list[Window]:
-    """Return bands of rows, evenly spread over ``grid``, from which a frame is judged before its tiles are read.
-
-    They are as wide as the grid, because EXR files store whole rows, often in blocks of 16.
-    """
+    """Return bands of rows, evenly spread over a grid, from which a frame is judged before its tiles are read."""
+    # EXR files store whole rows, often in blocks of 16.
     rows = min(max(16 // scale, 4), grid.height)
     last = grid.height // rows - 1
     tops = sorted({grid.y0 + last * i // (SAMPLE_BANDS - 1) * rows for i in range(SAMPLE_BANDS)})
@@ -115,8 +110,7 @@ def result_bytes(alignment: Alignment, *, error: bool) -> int:
 def memory_to_fuse(alignment: Alignment, contract: Contract, *, error: bool) -> int:
     """Return the smallest ``max_memory`` with which a frame can be fused, from its headers."""
     grid = aligned_grid(alignment.grid, contract.alignment)
-    # The LRHS lies in memory, with all features that the model may read: alpha has 1 channel, the others have 3. Of one
-    # of full size, only the beauty does.
+    # The LRHS lies in memory: alpha has 1 channel, other features have 3. Of one of full size, only the beauty does.
     channels = 3 if contract.scale == ONE_SIZE else 3 * len(contract.lrhs) + 1
     lrhs = grid.width * grid.height * channels * 4
     return FIXED_MEMORY + result_bytes(alignment, error=error) + lrhs + tile_bytes(alignment, contract)
@@ -145,10 +139,7 @@ class _Split(NamedTuple):
 
 
 def _splits(side: tuple[int, int], grid: tuple[int, int], overlap: int, alignment: int) -> Iterator[_Split]:
-    """Yield all ways to cut a side (start, end) of the ``grid`` into equal multiples of ``alignment``.
-
-    The last range may be shorter.
-    """
+    """Yield all ways to cut a side (start, end) of the grid into multiples of ``alignment``, equal but for the last."""
     start, end = side
     units = -(-(end - start) // alignment)
     for length in sorted({-(-units // count) * alignment for count in range(1, units + 1)}):

@@ -19,8 +19,8 @@ from oiio_msspl.fusion.checks.likeness import CONTROL, by_shift, fine_structure
 from oiio_msspl.image.arrays import Array, quantile
 from oiio_msspl.image.filters import blurred
 
-#: Edges belong together if they fit by this many standard deviations better than the control. The albedo is compared in
-#: two ways, and the better one counts, so chance reaches further.
+#: Edges belong together if they fit by this many standard deviations better than the control: the albedo by more,
+#: because it is compared in two ways, and the better one counts.
 FITS = {ALBEDO: 3.5, NORMAL: 1.5}
 #: AOVs that fit each other this well are of one frame. If normals fit the picture this well, it shows surfaces.
 SAME_FRAME = 4.0
@@ -34,8 +34,7 @@ SAME_PATTERN = 0.6
 #: An AOV with edges at fewer pixels is not judged.
 MIN_EDGES = 200
 #: Normals are noise if, at this fraction of their edges, noise makes up this fraction of the difference: under motion
-#: blur, each sample shows another moment. Without motion blur, renders at 1 spp of six scenes reach 0.45 in the one
-#: that is all fine grooves, and 0.14 in the others.
+#: blur, each sample shows another moment. Without it, renders at 1 spp reach 0.45 in a scene full of fine grooves.
 MOSTLY_NOISE = 0.5
 #: A difference of log albedo, or the length of a difference of normals, counts as an edge from here.
 EDGE = 0.2
@@ -66,14 +65,14 @@ def judge_aovs(low: Array, hrls: HrlsAverages) -> Aovs:
         lengths[ALBEDO] = _length(of_albedo)
     if NORMAL in hrls.aovs:
         lengths[NORMAL] = np.minimum(hrls.aovs[NORMAL], 0.5)
-    edges = {name: _Edges.of(v) for name, v in lengths.items() if np.count_nonzero(v > EDGE) >= MIN_EDGES}
+    edges = {name: _Edges(v) for name, v in lengths.items() if np.count_nonzero(v > EDGE) >= MIN_EDGES}
     if not edges:
         return Aovs()
     total = low + high
     lit = total[total > 0]
     floor = 0.1 * quantile(lit, 0.5) if lit.size else 1.0
     differences = _log_differences(total, floor)
-    picture = _Edges.of(_length(differences))
+    picture = _Edges(_length(differences))
     shifted = {name: shift for name, v in edges.items() if (shift := picture.shift_of(v)) is not None}
     fits = {name: v.fit(picture) for name, v in edges.items()}
     doubtful = [name for name, fit in fits.items() if fit < FITS[name] and name not in shifted]
@@ -95,7 +94,7 @@ def _foreign(
         return []
     # If shapes are seen, so are colours. Even light shows colours without shapes.
     if doubtful != [ALBEDO] or fits.get(NORMAL, 0) < SAME_FRAME:
-        first, second = (_Edges.of(_length(differences)) for differences in renders)
+        first, second = (_Edges(_length(differences)) for differences in renders)
         if first.fit(second) < VISIBLE:
             return []
     if len(edges) == 2 and len(doubtful) == 1 and edges[ALBEDO].fit(edges[NORMAL]) > SAME_FRAME:
@@ -121,16 +120,11 @@ def _length(differences: list[Array]) -> Array:
     return np.minimum(np.sqrt(np.square(differences[0]) + np.square(differences[1])), 1)
 
 
-@dataclass(frozen=True)
 class _Edges:
     """The edges of a picture (h, w)."""
 
-    spectrum: NDArray[np.complexfloating]
-    shape: tuple[int, ...]
-
-    @classmethod
-    def of(cls, values: Array) -> _Edges:
-        return cls(np.fft.rfft2(fine_structure(values)), values.shape)
+    def __init__(self, values: Array) -> None:
+        self.spectrum, self.shape = np.fft.rfft2(fine_structure(values)), values.shape
 
     def fit(self, picture: _Edges) -> float:
         """Return by how many standard deviations two pictures fit better than with a shift."""

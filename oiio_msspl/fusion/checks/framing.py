@@ -18,9 +18,8 @@ from oiio_msspl.fusion.checks.likeness import BETTER, Fit, fine_fits, fits_at_al
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import blurred, box_downsample, interpolate
 
-#: A framing counts if the pictures, moved by it, fit clearly better. In a picture with few edges, noise looks like a
-#: shift. If it explains this fraction of the difference that tone curve and blur leave, a little better is enough. In
-#: a large picture noise explains less, and the second number is enough, in pixels.
+#: A framing counts if the pictures, moved by it, fit clearly better: with few edges, noise looks like a shift. A little
+#: better is enough if it explains this fraction, or this many pixels, of the difference that tone curve and blur leave.
 MIN_EXPLAINED, MIN_EXPLAINED_PIXELS = 0.2, 3000
 #: It also counts if it explains this fraction: smooth pictures have no fine structure that could fit better.
 OBVIOUS = 0.5

@@ -29,13 +29,11 @@ from oiio_msspl.model.render_mean import lrhs_share
 LITTLE, SMOOTH = 0.085, 0.25
 #: The limit for a model that denoises albedo and normal before. Rooms have this noise at some 4 to 16 spp.
 LITTLE_WITH_CLEAN_AOVS = 0.12
-#: The limit for pairs of two sizes, by scale. Their difference is free of texture. The larger the pixels of the LRHS,
-#: the more detail the models for more noise lose, so the limit grows.
+#: The limit for pairs of two sizes, by scale: the larger LRHS pixels are, the more detail models for more noise lose.
 LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
-#: The limit for pairs of two sizes and a model that denoises albedo and normal before, at every scale. It holds for the
-#: noise of both renders' mean: if the LRHS has 16 times the samples of the HRLS in the same area, 4 spp may be enough.
+#: The limit for pairs of two sizes and a model that denoises albedo and normal before: for the noise of their mean.
 LITTLE_OF_MEAN = 0.075
-#: The limit for noise that a filter has spread is this number times the scale. It grows for the same reason.
+#: The limit for noise that a filter has spread is this number times the scale.
 LITTLE_SPREAD = 0.009
 #: Blocks of an AOV show edges or texture from this variance on. There, neighbouring pixels of clean AOVs correlate by
 #: more than the second number, in the mean: at 1, 2, 4, 8 and 16 spp by some 0.27, 0.37, 0.44, 0.47 and 0.50.

@@ -23,14 +23,11 @@ from oiio_msspl.image.parallel import for_row_blocks
 
 #: HRLS pixels on a side of the squares over which the shares of layers are averaged.
 SQUARE = 64
-#: The least doubt of a layer, relative to the largest. Without it, a layer gains up to 0.01 dB more, but one that has
-#: hardly any noise by chance would push a large error into others.
+#: The least doubt of a layer, relative to the largest: one without noise by chance pushes no large error into others.
 LEAST_DOUBT = np.float32(0.25)
-#: What is spread by doubt adds at most this share to the sum of the layers, and takes at most this share of a layer's
-#: light, so none becomes black where the sum is far off.
+#: What is spread by doubt adds at most this share to the sum of the layers, and takes at most this share of a layer.
 MOST_SPREAD = np.float32(0.9)
-#: What is still lacking then is spread by the square of the doubt, at least this. It is the light of a rare lamp that
-#: the layers of few samples miss, and not of a sky behind it, which they know.
+#: What is still lacking, such as the light of a rare lamp, is spread by the square of the doubt, at least this.
 LEAST_SQUARED_DOUBT = np.float32(1e-3)
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
 DARKEST_COLOUR = 1e-3

@@ -21,8 +21,7 @@ from oiio_msspl.model.contract import ONE_SIZE
 
 #: Rows of a band whose weights stay in a core's cache while several planes are averaged.
 CACHED_ROWS = 16
-#: A fit averages 5 x 5 LRHS pixels so far apart, and then the averages likewise. The smaller the scale, the fewer
-#: samples a pixel has, so more of them are needed.
+#: A fit averages 5 x 5 LRHS pixels so far apart, and then the averages likewise.
 STEPS = {ONE_SIZE: (1, 2, 4), 2: (1, 3), 4: (1, 2), 8: (1, 2)}
 #: Pixels of the HRLS choose among fits around them with the spread divided by this.
 SHARPER = 1.4

@@ -26,8 +26,7 @@ from oiio_msspl.image.arrays import Array, blank, planes_of, unload
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.session import Session
 
-#: More light groups than this are fused at half of the resolution at x2, in 0.4 of the time. Each lamp lights the same
-#: surfaces, so the beauty has their detail. Components have detail of their own.
+#: More light groups than this are fused at half of the resolution at x2. The beauty has the detail of their surfaces.
 MOST_AT_FULL_SIZE = 5
 #: The scale at which half of the resolution is that of the LRHS.
 HALF = 2

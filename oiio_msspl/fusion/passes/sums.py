@@ -20,13 +20,11 @@ from oiio_msspl.image.parallel import one_ahead
 
 #: Largest part of the beauty's light that may be wrong in a sum: what half floats round, and a few repaired pixels.
 TOLERANCE = 2e-3
-#: What a sum is compared on: so many strips of rows, evenly spaced. A quarter of a 1080p frame. Files are mostly
-#: compressed in blocks of 16 rows, so each strip is one block.
+#: A sum is compared on so many strips of rows, evenly spaced: a quarter of a 1080p frame, in the blocks of most files.
 STRIPS, ROWS = 17, 16
 #: Largest residual that lossy compression explains.
 LOSSY = 0.05
-#: A layer has no noise if at least this share of its lit pixels equals a pixel beside it, within this share of their
-#: light. Layers with noise have few such pixels.
+#: A layer has no noise if this share of its lit pixels equals a pixel beside it, within this share of their light.
 NOISE_FREE, EQUAL = 2 / 3, 0.01
 #: A layer with fewer lit pixels is not judged.
 FEWEST = 64

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
+from oiio_msspl.aovs.features import NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD, MappedRender
 from oiio_msspl.aovs.motion import user_fields
 from oiio_msspl.aovs.views import name_of
@@ -23,7 +23,6 @@ from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.motion.source import MotionSource, find_motion
 from oiio_msspl.fusion.passes.sums import check_sum
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.features import SIGNED_FEATURES
 from oiio_msspl.jobs.advice import advise
 from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
 from oiio_msspl.jobs.sequence import is_sequence, next_file
@@ -262,7 +261,7 @@ def _pixel_facts(render: MappedRender) -> list[str]:
         for name, values in render.read(rows).items():
             finite = np.isfinite(values)
             not_finite[name] += int(values.size - np.count_nonzero(finite))
-            if name not in SIGNED_FEATURES:
+            if name != NORMAL:
                 negative[name] += int(np.count_nonzero(finite & (values < 0)))
             brightest[name] = max(brightest.get(name, 0.0), float(np.abs(values[finite]).max(initial=0.0)))
     if brightest[RGB] == 0:

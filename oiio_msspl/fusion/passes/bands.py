@@ -109,6 +109,8 @@ class Band:
         self.hrls_core, self._hrls_area = (in_hrls_pixels(window, self.scale) for window in (core, self.area))
         self._hrls_rows = self.hrls_core.slices(self._hrls_area)[0]
         self._beauty = sources.planes(sources.beauty.rgb, self._hrls_area)
+        self.beauty = self._beauty[:, self._hrls_rows]
+        """The fused beauty (3, h, w) over the core."""
         self.low_beauty = downsampled(self._beauty, self.scale)
         """The fused beauty (3, h, w) over the area, at the LRHS's resolution."""
         self.to_fit = [job for job in jobs if job.remainder or self._has_light(job, full_size)]
@@ -141,11 +143,6 @@ class Band:
         self._lrhs_layers = read_lrhs(sources.low, alignment, self.area, [RGB, *lrhs]) if lrhs else {}
         self._fits: dict[Sequence[int], BeautyFit] = {}
         self._guides = self._compared(images) if self.to_fit else None
-
-    @property
-    def beauty(self) -> Array:
-        """The fused beauty (3, h, w) over the core."""
-        return self._beauty[:, self._hrls_rows]
 
     def fit_at(self, steps: tuple[int, ...]) -> BeautyFit:
         """Return the beauty that layers are fitted to, see :data:`oiio_msspl.fusion.passes.lines.STEPS`."""

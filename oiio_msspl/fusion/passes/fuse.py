@@ -21,7 +21,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.passes.bands import Band, PassInputs, PassSources, band_windows, estimated_of, in_both
 from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, doubts_of, make_exact
-from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, lrhs_names
+from oiio_msspl.fusion.passes.layers import LayerLight, colours_of, is_large, layer_names, light_of, lrhs_names
 from oiio_msspl.fusion.passes.lines import STEPS
 from oiio_msspl.fusion.passes.network import LayersByNetwork
 from oiio_msspl.fusion.passes.plan import PassJob, plan_passes
@@ -136,13 +136,13 @@ def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, La
 
 
 def _sources_of(inputs: PassInputs, low: LayerLight, high: LayerLight) -> PassSources:
-    lrhs, hrls = low.pixels, high.pixels
+    lrhs, hrls, names = low.pixels, high.pixels, colours_of(high.names)
     if inputs.averaged is not None:
         # Light is divided by the colours of this frame, because those are written.
-        colours = high.file.load(high.colours.values(), on_disk=is_large(high.file)).layers
+        colours = high.file.load(names.values(), on_disk=is_large(high.file)).layers
         lrhs, averaged = inputs.averaged
         hrls = replace(averaged, layers=averaged.layers | colours)
-    return PassSources(**vars(inputs), low=lrhs, high=hrls, colours=high.colours)
+    return PassSources(**vars(inputs), low=lrhs, high=hrls, colours=names)
 
 
 def _read_bands(sources: PassSources, jobs: Sequence[PassJob], network: LayersByNetwork) -> Iterator[Band]:

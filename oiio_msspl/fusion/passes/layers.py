@@ -27,16 +27,11 @@ class LayerLight:
     """The light of the layers of a render, as features of :attr:`pixels`."""
 
     file: MappedRender
-    """Has these features beside its own, and :attr:`colours`."""
+    """Has the features of :func:`with_light`."""
     names: Mapping[AdditiveLayer, str]
     """Names of features, by layer."""
     pixels: ReadableRender
     """Where the features are read: all are decoded, or each read decodes what it needs."""
-
-    @property
-    def colours(self) -> dict[Factor, str]:
-        """Names, as features, of the colours by which layers are multiplied."""
-        return _colours(self.names)
 
 
 def light_of(
@@ -53,7 +48,7 @@ def light_of(
         decoded: the render, perhaps in memory. It is used if it has the features of :func:`with_light`.
     """
     file = with_light(render, names)
-    needed = [RGB, ALBEDO, NORMAL, *names.values(), *_colours(names).values()]
+    needed = [RGB, ALBEDO, NORMAL, *names.values(), *colours_of(names).values()]
     if isinstance(decoded, Render) and decoded.layers.keys() >= file.features.keys() & {*needed}:
         return LayerLight(file, names, decoded)
     return LayerLight(file, names, file.load(needed, on_disk=is_large(file)) if decode else file)
@@ -62,11 +57,12 @@ def light_of(
 def with_light(render: MappedRender, names: Mapping[AdditiveLayer, str]) -> MappedRender:
     """Return a render with the light of layers, and the colours that it is multiplied by, as further features."""
     light = {name: layer.formula for layer, name in names.items()}
-    colours = {name: FeatureFormula((factor,)) for factor, name in _colours(names).items()}
+    colours = {name: FeatureFormula((factor,)) for factor, name in colours_of(names).items()}
     return replace(render, features=render.features | light | colours)
 
 
-def _colours(names: Iterable[AdditiveLayer]) -> dict[Factor, str]:
+def colours_of(names: Iterable[AdditiveLayer]) -> dict[Factor, str]:
+    """Return names, as features, of the colours by which layers are multiplied."""
     factors = dict.fromkeys(layer.factor for layer in names if layer.factor is not None)
     return {factor: f"colour {i}" for i, factor in enumerate(factors)}
 

@@ -111,10 +111,18 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
 
 
 def _layer_sums(pixels: Array, usable: NDArray[np.bool_]) -> list[float]:
-    """Return a layer's negative and its positive light, equal pixels, lit ones, and if a value is finite."""
-    values = pixels[usable]
-    light = [-np.minimum(values, 0).sum(dtype=np.float64), np.maximum(values, 0).sum(dtype=np.float64)]
-    return [*light, *_equal_pixels(pixels), float(np.isfinite(pixels).any())]
+    """Return a layer's negative and positive light, lit pixels like one beside them, all lit ones, if one is finite."""
+    negative, positive = (np.maximum(sign * pixels[usable], 0).sum(dtype=np.float64) for sign in (-1, 1))
+    red, green, blue = np.moveaxis(pixels, -1, 0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        light = red + green + blue
+        lit = light > 0
+        equal = np.zeros_like(lit)
+        for values, result in ((light, equal), (light.T, equal.T)):
+            same = np.abs(values[1:] - values[:-1]) <= np.float32(EQUAL / 2) * (values[1:] + values[:-1])
+            result[1:] |= same
+            result[:-1] |= same
+    return [negative, positive, np.count_nonzero(equal & lit), np.count_nonzero(lit), np.isfinite(pixels).any()]
 
 
 def _superfluous(light: LayerLight, layers: Sequence[AdditiveLayer]) -> list[str]:
@@ -155,17 +163,3 @@ def _strips_of(
         with np.errstate(invalid="ignore", over="ignore"):
             rest = sought - sum(pixels)
         yield pixels, sought, rest, np.isfinite(rest) & (sought < brightest)
-
-
-def _equal_pixels(pixels: Array) -> tuple[int, int]:
-    """Count the lit pixels of a layer (h, w, 3) that equal one of the four next to them, and all lit ones."""
-    red, green, blue = np.moveaxis(pixels, -1, 0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        light = red + green + blue
-        lit = light > 0
-        equal = np.zeros_like(lit)
-        for values, result in ((light, equal), (light.T, equal.T)):
-            same = np.abs(values[1:] - values[:-1]) <= np.float32(EQUAL / 2) * (values[1:] + values[:-1])
-            result[1:] |= same
-            result[:-1] |= same
-    return int(np.count_nonzero(equal & lit)), int(np.count_nonzero(lit))

@@ -25,8 +25,6 @@ T = TypeVar("T", bound=np.generic)
 #: ``negative`` ones, colours out of gamut, were set to 0.
 RepairCounts = Counter[tuple[str, str]]
 
-#: Features that may be negative.
-SIGNED_FEATURES = {NORMAL}
 #: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
 #: render, except for rare light (:mod:`oiio_msspl.fusion.tiles.guards`). The LRHS is the mean of s x s HRLS pixels, so
 #: s^2 would be the exact bound without noise. At 64, rooms lose up to 4 % of their light at 1 spp.
@@ -219,7 +217,7 @@ def read_features(
     layers = render.read(stored.shift(render.display_window.x0, render.display_window.y0), features)
     result = {}
     for name, values in layers.items():
-        repaired, bad = repair(values, signed=name in SIGNED_FEATURES)
+        repaired, bad = repair(values, signed=name == NORMAL)
         if bad is not None:
             if counts is not None and counted is not None:
                 inside = counted.intersect(stored).slices(stored)

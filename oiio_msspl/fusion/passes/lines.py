@@ -183,13 +183,12 @@ class BeautyFit:
         """
 
         def fit(part: slice) -> None:
-            # NumPy's settings for errors belong to the thread.
-            with np.errstate(over="ignore", invalid="ignore"):
-                for layer, out in zip(layers[part], results[part], strict=True):
-                    self._fit(layer, out, few_samples)
+            for layer, out in zip(layers[part], results[part], strict=True):
+                self._fit(layer, out, few_samples)
 
         for_row_blocks(fit, len(layers), self._beauty.size)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _fit(self, layer: Array, out: Array, few_samples: bool) -> None:
         means = self._mean(np.concatenate([layer, layer * self._low_beauty]))
         mean, products = means[:3], means[3:]

@@ -95,6 +95,12 @@ def fuse_layers_of(low, high, beauty, aovs=None, **options):
     return fuse_passes(PassInputs(low, high, beauty, high.additive_sets), **options)
 
 
+def pixels_of(result, index=0):
+    """A fused layer of the first set, (h, w, 3)."""
+    channels = result.jobs[0].layers.layers[index].channels
+    return np.stack([result.pixels.get(channel, 0, HEIGHT) for channel in channels], axis=-1)
+
+
 def layer(channels, name=""):
     prefix = f"{name}." if name else ""
     return np.stack([channels[f"{prefix}{c}"] for c in "RGB"], axis=-1).astype(np.float64)
@@ -143,8 +149,7 @@ def test_an_albedo_without_noise_sharpens_components(tmp_path):
     for guides in ({}, {"albedo": albedo.astype(np.float16)}):
         beauty = sum(clean.values()).astype(np.float32)
         result = fuse_layers_of(low, high, beauty, guides)
-        found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.jobs[0].layers.layers[0].channels], axis=-1)
-        errors.append(np.abs(found - clean["light_a"]).mean())
+        errors.append(np.abs(pixels_of(result) - clean["light_a"]).mean())
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -173,8 +178,7 @@ def test_lamps_are_told_apart_by_albedos_above_1(tmp_path):
     errors = []
     for given in ({}, guides):
         result = fuse_layers_of(low, high, beauty, given)
-        found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.jobs[0].layers.layers[0].channels], axis=-1)
-        errors.append(np.abs(found - clean["light_a"]).mean())
+        errors.append(np.abs(pixels_of(result) - clean["light_a"]).mean())
     assert errors[1] == errors[0]
 
 
@@ -191,8 +195,7 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
     found, steps = [], []
     for of_layers in (None, session):
         result = fuse_layers_of(*pair, beauty, session=of_layers, progress=lambda *told: steps.append(told))
-        channels = result.jobs[0].layers.layers[0].channels
-        found.append(np.stack([result.pixels.get(c, 0, HEIGHT) for c in channels], axis=-1))
+        found.append(pixels_of(result))
         done, count = steps[-1]
         assert done == count > 0
     errors = [np.abs(each - clean["light_a"]).mean() for each in found]
@@ -223,10 +226,7 @@ def test_many_light_groups_are_fused_at_half_of_the_resolution_at_x2(tmp_path, s
     beauty, errors = fuse(*pair, session, clean_aovs=True), []
     for of_layers in (None, session):
         result = fuse_layers_of(*pair, beauty, session=of_layers)
-        found = {
-            each.name: np.stack([result.pixels.get(c, 0, HEIGHT) for c in each.channels], axis=-1)
-            for each in result.jobs[0].layers.layers
-        }
+        found = {each.name: pixels_of(result, i) for i, each in enumerate(result.jobs[0].layers.layers)}
         assert_sum([each.astype(np.float64) for each in found.values()], beauty.rgb.astype(np.float64))
         errors.append(np.mean([np.abs(found[name] - clean[name]).mean() for name in clean]))
     at_full_size, at_half_size = (vars(session).get(name) for name in ("layer_session", "half_layer_session"))
@@ -312,8 +312,7 @@ def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_
         if whole:
             monkeypatch.setattr(FramePair, "_lit_part", lambda *_: None)
         result = fuse_layers_of(*pair, beauty, session=session)
-        channels = result.jobs[0].layers.layers[1].channels
-        found.append(np.stack([result.pixels.get(c, 0, HEIGHT) for c in channels], axis=-1))
+        found.append(pixels_of(result, 1))
     assert sizes[0] == sizes[2] == sizes[3] == 2 * sizes[1]
     assert np.abs(found[0] - found[1]).max() < 0.05
     assert found[0][50, 100].min() > 0.5

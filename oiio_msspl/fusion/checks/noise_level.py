@@ -97,7 +97,7 @@ def has_clean_aovs(hr: ReadableRender, alignment: Alignment, least: float = CLEA
     """Return whether albedo and normal of an HRLS have hardly any noise, or no edge that could show it.
 
     At an edge, the few samples of a pixel fall on either side by chance, so neighbouring pixels differ more than those
-    of a clean edge. Their noise does not depend on the light. Small samples all over the frame are read.
+    of a clean edge. Small samples all over the frame are read.
     """
     variances, products = [np.zeros(0)], [np.zeros(0)]
     with hr.cache_strips(CACHE_BYTES):

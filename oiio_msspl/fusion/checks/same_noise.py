@@ -47,8 +47,7 @@ def compare_noise(low: Array, quarters: Array) -> tuple[bool | None, bool]:
     """
     if min(low.shape) < 4 * BLOCK:
         return None, True
-    rows, columns = (slice(BLOCK, (side - BLOCK) // BLOCK * BLOCK) for side in low.shape)
-    inner = rows, columns
+    rows, columns = inner = tuple(slice(BLOCK, (side - BLOCK) // BLOCK * BLOCK) for side in low.shape)
     sums, picture = _sums(quarters.astype(np.float64))[..., rows, columns], low[inner].astype(np.float64)
     brightness = blurred((low + box_downsample(quarters, 2)) / np.float32(2), 2)[inner].astype(np.float64)
     # Relative differences, so that no bright corner dominates.

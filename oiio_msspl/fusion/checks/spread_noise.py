@@ -45,10 +45,9 @@ LEAST_CORRELATED = 0.25
 def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool | None:
     """Return whether the noise of neighbouring pixels is alike in both renders; None if there is hardly any noise.
 
-    Fine texture in the HRLS also makes neighbours alike. It cancels in the difference of the LRHS and the averaged
-    HRLS, and noise does not. So neighbours must correlate in the HRLS and in this difference. Small samples all over
-    the frame are read. One render, which is given as both, has no difference: nearly all of its blocks must correlate,
-    also those without texture.
+    Fine texture in the HRLS also makes neighbours alike, but cancels in the difference of the LRHS and the averaged
+    HRLS. So neighbours must correlate in both. Of one render, which is given as both, nearly all blocks must correlate,
+    also those without texture. Small samples all over the frame are read.
     """
     scale, correlations = alignment.scale, []
     for low, high, exposure in samples_of(lr, hr, alignment):

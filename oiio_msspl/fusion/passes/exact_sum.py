@@ -74,8 +74,7 @@ def make_exact(
 def doubts_of(job: PassJob, band: Band, hrls: Array, lrhs: Array) -> Array:
     """Return how uncertain each layer is, (layers, h, w) over the core, at most 1, by :meth:`Band.renders_of`.
 
-    It is the root of the mean difference between the two renders, relative to the layer where that is largest. A layer
-    that the LRHS lacks is most uncertain.
+    It is the root of the mean difference of both renders, relative to the largest; 1 for a layer that the LRHS lacks.
     """
     shared = in_both(job, len(hrls))
     differences = np.abs(hrls - lrhs[: len(hrls)]).mean(axis=1)
@@ -120,10 +119,9 @@ def spread_rest(layers: Array, beauty: Array, doubts: Array | None) -> None:
 
 
 class SharesAround:
-    """How the layers of a set share the light around a pixel: means over squares of the frame, interpolated.
+    """How the layers of a set share the light around a pixel where none has a sample: means over squares of the frame.
 
-    The beauty is divided by them where no layer has a sample near. The renders are read once more for that, and only if
-    there is such a pixel. The shares do not depend on the bands in which a frame is fused.
+    The renders are read once more for that, and only if there is such a pixel.
     """
 
     def __init__(self, sources: PassSources) -> None:

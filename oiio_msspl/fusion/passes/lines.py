@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits layers at the LRHS's resolution as lines of the fused beauty, and applies the lines at full resolution.
 
-The beauty has little noise. A fit takes averages of a layer only, so it is fast. This is first-order regression with
-cross-bilateral weights (Bitterli et al. 2016). The fit at low resolution is that of the fast guided filter (He and Sun
-2015). Everything here works on planes: float32 arrays (n, h, w).
+This is first-order regression with cross-bilateral weights (Bitterli et al. 2016), at low resolution as in the fast
+guided filter (He and Sun 2015). Everything here works on planes: float32 arrays (n, h, w).
 """
 
 from __future__ import annotations

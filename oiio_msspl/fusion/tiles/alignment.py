@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The alignment of a pair: how its pixels lie over each other.
 
-It follows from the display windows: the low-resolution frame shows the same picture with 1/s of the pixels. The data
-windows say which part of the frame was rendered (overscan, crop region), or which part is not empty.
+Display windows show the same picture. Data windows say which part of it was rendered, or which part is not empty.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ _SQUARE, _RARE = 8, 0.25
 #: A tile has no noise if its renders differ nowhere by more than this, log-encoded: half a code of an 8-bit picture.
 NOISE_FREE = 1 / 512
 #: Exposed radiance above which light that both renders show is taken from the HRLS. Noise is hardly ever so bright in
-#: both. At a quarter of this, one of 38 rendered views has a firefly that would pass.
+#: both: at a quarter of this, in one of 38 views.
 LIGHT = 4096.0
 #: Exposed radiance above which a light without noise keeps the pixels of the only render. It has no noise if all of
 #: 3 x 3 pixels differ from the one in the middle by this share of it at most.
@@ -38,8 +38,7 @@ LEAST_CHANNEL, BRIGHT, DAZZLING = np.float32(0.1), 0.5, 9.0
 PURE_REACH, PURE = 3, np.float32(0.94)
 #: A surface becomes black if this many LRHS pixels around are black. Networks look as far.
 FAR = 15
-#: A surface becomes black in a pass if this many HRLS pixels around are black. Black passes are common, and a network
-#: leaves a trace of light in them.
+#: The same for a pass, in HRLS pixels: black passes are common, and a network leaves a trace of light in them.
 LAYER_REACH = 16
 #: HRLS pixels around an empty pixel that show no surface either. Thin smears have empty samples between them.
 SMEAR = 8

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cuts a frame into overlapping tiles, so that memory depends on the tile and not on the frame.
 
-Tiles depend on the model and on the size of the frame, and those of a pass also on where it has light. They never
-depend on memory: a network sees only a part of the frame in each tile, so other tiles give slightly other pixels, and
-frames of one shot must not differ because machines have more or less memory.
+Tiles depend on the model and on the size of the frame, and those of a pass also on where it has light. Other tiles give
+slightly other pixels, so they never depend on memory: frames of one shot must not differ from machine to machine.
 """
 
 from __future__ import annotations
@@ -25,11 +24,9 @@ MAX_MEMORY = 3 << 30
 FIXED_MEMORY = 350 << 20
 #: Fraction of the memory for decoded rows that neighbouring tiles read. ``bytes_per_pixel`` of a model includes it.
 STRIPS_FRACTION = 1 / 6
-#: Most bytes of a tile: what ``MAX_MEMORY`` leaves beside an 8K frame. Other tiles give other pixels, so this does not
-#: depend on the memory that the user allows.
+#: Most bytes of a tile: what ``MAX_MEMORY`` leaves beside an 8K frame.
 TILE_MEMORY = 1720 << 20
-#: Memory is estimated from the tiles of this many LRHS pixels on a side. Larger frames have no larger tiles, and a
-#: damaged header may claim millions of them.
+#: Memory is estimated from this many LRHS pixels on a side: larger frames, or damaged headers, have no larger tiles.
 _LARGEST_SIDE = 16384
 #: Bands of rows that :func:`sample_bands` spreads over a frame.
 SAMPLE_BANDS = 8

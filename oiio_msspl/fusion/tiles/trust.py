@@ -84,6 +84,8 @@ def trust_renders(
     variance = np.float32(share * (scale**2 if scale > 1 else 1 - share))
     rounding = np.float32(2 * ROUNDING**2) * np.square(np.maximum(low, high))
     noise = variance * (np.square(low - high) + rounding).sum(axis=0)
+    # ``change`` is the squared difference to the render that is put back, ``energy`` the same at its own resolution,
+    # ``noise`` what noise explains of that, and ``common`` the product of the differences to both renders.
     best = high if scale > 1 else _exposed(render, exposure)
     darker = (best - own).sum(axis=0) < 0
     common = ((low - own) * (high - own)).sum(axis=0)
@@ -111,15 +113,7 @@ def _exposed(values: Array, exposure: float) -> Array:
 def _trust_in_areas(
     energy: Array, noise: Array, common: Array, change: Array, darker: Mask, scale: int, reach: int
 ) -> Array:
-    """Return how much of a difference is detail by the means of windows, (h, w) in [0, 1].
-
-    Args:
-        energy, noise: squared difference to the render that is put back, and the part of it that noise explains; these
-            and the next two are relative to the brightness.
-        common: product of both renders' differences to the picture, at the LRHS's resolution.
-        change: squared difference to the render that is put back, at this resolution.
-        darker: the renders are darker than the picture.
-    """
+    """Return how much of a difference is detail by the means of windows, (h, w) in [0, 1]."""
     most, largest = np.float32(LARGEST * scale**2), np.float32(LARGEST)
     energy, least = np.minimum(energy, most), np.minimum(noise, most)
     common, change = np.clip(common, -largest, largest), np.minimum(change, largest)
@@ -155,7 +149,7 @@ def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple
 def _trust_in_points(
     energy: Array, noise: Array, common: Array, change: Array, darker: Mask, scale: int, reach: int
 ) -> Array:
-    """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1]; see :func:`_trust_in_areas`."""
+    """Return how much of a difference is detail pixel by pixel, (h, w) in [0, 1]."""
     size, zero = min(AROUND, reach // 2), np.float32(0)
     is_point = change > np.float32(POINT)
     light, brighter = np.where(darker, zero, energy), np.where(is_point & ~darker, change, zero)

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import ReadableRender, Render, Window
@@ -22,7 +21,7 @@ from oiio_msspl.fusion.neighbours.bands import for_bands, rows_in_bands, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
 from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS, Features, RenderBand, RenderPair, read
 from oiio_msspl.fusion.neighbours.results import Images, ResultBand, images_of
-from oiio_msspl.fusion.neighbours.trust import COARSE, Judge, Light, RenderLight, ResultLight
+from oiio_msspl.fusion.neighbours.trust import WHOLE, Judge, Light, RenderLight, ResultLight, cells
 from oiio_msspl.image.arrays import Array, blank, unload
 from oiio_msspl.image.parallel import two_at_a_time
 
@@ -67,7 +66,7 @@ def average_renders(
     """
     alignment = pair.alignment
     window = alignment.hr_data_window
-    light = RenderLight(alignment, *pair.colours)
+    light = RenderLight(alignment, *pair.colours, pair.colours[0])
     low: Features = {}
     if not pair.is_one_render:
         low = {name: values.copy() for name, values in read(pair.lr, alignment.lr_data_window, features).items()}
@@ -78,7 +77,7 @@ def average_renders(
         return RenderBand(pair, light, low, high, core, area)
 
     weight = _weight(sum(image.shape[-1] for image in high.values()))
-    frames = _average(light, before, after, band, RenderPair.cells, weight)
+    frames = _average(light, before, after, band, lambda pair: pair.cells, weight)
     hr = _replaced(pair.hr, high, window)
     return hr if pair.is_one_render else _replaced(pair.lr, low, alignment.lr_data_window), hr, frames
 
@@ -97,7 +96,8 @@ def average_results(
     """
     alignment = frame.alignment
     window = alignment.hr_data_window
-    light = ResultLight(alignment, frame.lrhs_luminance, frame.hrls_luminance, _picture(frame))
+    renders = frame.lrhs_luminance[..., None], frame.hrls_luminance[..., None]
+    light = ResultLight(alignment, *renders, _picture(frame))
     images: Images = {name: blank(image.shape, on_disk=False) for name, image in images_of(frame, window).items()}
 
     def band(core: Window, area: Window) -> ResultBand:
@@ -110,10 +110,10 @@ def average_results(
     return replace(frame, rgb=images[RGB], alpha=images.get("alpha"), frames=frames)
 
 
-def _cells(frame: FusedFrame, light: Light) -> list[Array]:
-    """Return the colours of a fused frame, averaged to the cells of a light. They are kept for its other neighbours."""
+def _cells(frame: FusedFrame) -> list[Array]:
+    """Return the colours of a fused frame, averaged to large cells. They are kept for its other neighbours."""
     if frame.coarse is None:
-        frame.coarse = light.cells(_picture(frame))
+        frame.coarse = cells(_picture(frame), frame.alignment.scale, WHOLE)
     return [frame.coarse]
 
 
@@ -128,14 +128,13 @@ def _average(
     before: Sequence[Hop[F]],
     after: Sequence[Hop[F]],
     band_of: Callable[[Window, Window], Band[F]],
-    cells_of: Callable[[F, Light], Sequence[Array]],
+    cells_of: Callable[[F], Sequence[Array]],
     weight: float = 1.0,
 ) -> Array:
     """Average a frame with its neighbours, band by band, and return the number of frames (h, w, 1)."""
     window = light.alignment.hr_data_window
     frames: Array = blank((window.height, window.width, 1))
-    coarse_light = light.coarser() if light.cell < COARSE // 2 else light
-    sides = two_at_a_time(lambda hops: (hops, _coarse_trust(coarse_light, hops, cells_of)), (before, after))
+    sides = two_at_a_time(lambda hops: (hops, _coarse_trust(light, hops, cells_of)), (before, after))
 
     def work(core: Window, area: Window) -> None:
         band = band_of(core, area)
@@ -151,29 +150,22 @@ def _average(
     return frames
 
 
-def _coarse_trust(light: Light, hops: Sequence[Hop[F]], cells_of: Callable[[F, Light], Sequence[Array]]) -> list[Array]:
+def _coarse_trust(light: Light, hops: Sequence[Hop[F]], cells_of: Callable[[F], Sequence[Array]]) -> list[Array]:
     """Return how much each neighbour on one side counts by the light of large areas, see :meth:`Light.coarse_trust`."""
-    alignment, cell = light.alignment, np.float32(light.cell)
-    grid, window = alignment.grid, alignment.hr_data_window
-    path, result = Path(window, window, light.cell), []
+    alignment, window = light.alignment, light.alignment.hr_data_window
+    rows, columns = np.indices(light.shape).astype(np.float32)
+    x = np.minimum(columns * WHOLE + WHOLE // 2, window.width - 1) + window.x0
+    y = np.minimum(rows * WHOLE + WHOLE // 2, window.height - 1) + window.y0
+    path, result = Path(window, window, (x, y)), []
     for hop in hops:
         path.follow(hop.there, hop.back, hop.frame.alignment.hr_data_window)
-        rows, other = slice(0, len(path.valid)), hop.frame.alignment.grid
-        (from_x, from_y), (to_x, to_y) = path.starts(rows), path.positions(rows)
         # Cells count from the corner of each frame's grid.
-        moved_x = (to_x - from_x + np.float32((grid.x0 - other.x0) * alignment.scale)) / cell
-        moved_y = (to_y - from_y + np.float32((grid.y0 - other.y0) * alignment.scale)) / cell
-        y, x = np.mgrid[: light.shape[0], : light.shape[1]].astype(np.float32)
-        x, y = x + _of_shape(moved_x, light.shape), y + _of_shape(moved_y, light.shape)
-        colours = [sample_linear(image, x, y) for image in cells_of(hop.frame, light)]
-        result.append(light.coarse_trust(colours, _of_shape(path.valid, light.shape)))
+        (to_x, to_y), here, there = path.positions(slice(None)), alignment.grid, hop.frame.alignment.grid
+        at_x = columns + (to_x - x + np.float32((here.x0 - there.x0) * alignment.scale)) / np.float32(WHOLE)
+        at_y = rows + (to_y - y + np.float32((here.y0 - there.y0) * alignment.scale)) / np.float32(WHOLE)
+        colours = [sample_linear(image, at_x, at_y) for image in cells_of(hop.frame)]
+        result.append(light.coarse_trust(colours, path.valid))
     return result
-
-
-def _of_shape(plane: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Repeat the last row and column of a plane, or leave them out, so that it has a shape (h, w)."""
-    margins = [(0, max(0, side - own)) for side, own in zip(shape, plane.shape, strict=True)]
-    return np.pad(plane, margins, mode="edge")[: shape[0], : shape[1]]
 
 
 def memory_to_average_renders(window: Window, channels: int) -> int:

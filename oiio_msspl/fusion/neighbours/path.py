@@ -37,11 +37,11 @@ class Path:
     Args:
         area: the pixels that are followed.
         window: data window of their frame.
-        step: follow the middle of each square of ``step`` x ``step`` pixels alone.
+        pixels: x and y (h, w) of some pixels of the area, if these alone are followed.
     """
 
-    def __init__(self, area: Window, window: Window, step: int = 1) -> None:
-        self._area, self._start, self._end, self._step = area, window, window, step
+    def __init__(self, area: Window, window: Window, pixels: tuple[Array, Array] | None = None) -> None:
+        self._area, self._start, self._end = area, window, window
         #: How many hops were followed.
         self.hops = 0
         #: Positions (h, w) in pixels; None for the pixel itself.
@@ -50,9 +50,13 @@ class Path:
         #: Flat indices (h, w) of the nearest pixels in the data window of the last frame; None with ``x``.
         self.nearest: NDArray[np.intp] | None = None
         #: Where the last frame shows the same surface (h, w).
-        self.valid: Mask = np.ones((-(-area.height // step), -(-area.width // step)), bool)
+        self.valid: Mask = np.ones((area.height, area.width), bool)
         #: Where an object has moved that is not followed (h, w); None if nothing has.
         self.moved_objects: Mask | None = None
+        if pixels is not None:
+            self.x, self.y = x, y = pixels
+            self.nearest = nearest_indices(x - window.x0, y - window.y0, (window.height, window.width))
+            self.valid = np.ones(x.shape, bool)
 
     def follow(self, there: Motion, back: Motion, window: Window) -> None:
         """Go on to the next frame, whose data window is ``window``, by the motion to it and the way back."""
@@ -101,30 +105,16 @@ class Path:
         """Return values over a data window at flat indices; at these rows of the area if there are none."""
         if indices is not None:
             return values.reshape(-1).take(indices, mode="clip")  # a check of all indices takes as long as to take them
-        return np.asarray(self._thinned(values[self._rows(rows).slices(self._start)]))
+        return values[self._rows(rows).slices(self._start)]
 
     def positions(self, rows: slice) -> tuple[Array, Array]:
-        """Return the positions of some rows, x and y, (n, w) each."""
+        """Return the positions of some rows, x and y, (n, w) each; they are not to be changed."""
         if self.x is not None and self.y is not None:
             return self.x[rows], self.y[rows]
-        return self.starts(rows)
-
-    def starts(self, rows: slice) -> tuple[Array, Array]:
-        """Return x and y of the pixels where some rows start, (n, w) each; they are not to be changed."""
-        x, y = pixel_positions(self._rows(rows))
-        return self._thinned(x), self._thinned(y)
+        return pixel_positions(self._rows(rows))
 
     def _rows(self, rows: slice) -> Window:
-        top, step = self._area.y0, self._step
-        return replace(self._area, y0=top + rows.start * step, y1=min(top + rows.stop * step, self._area.y1))
-
-    def _thinned(self, plane: NDArray[Any]) -> NDArray[Any]:
-        """Return the pixels of a plane that are followed."""
-        if self._step == 1:
-            return plane
-        middle = self._step // 2
-        y, x = (np.minimum(np.arange(middle, side + middle, self._step), side - 1) for side in plane.shape[:2])
-        return plane[y[:, None], x]
+        return replace(self._area, y0=self._area.y0 + rows.start, y1=self._area.y0 + rows.stop)
 
     def place_in(self, window: Window) -> Window:
         """Return the rows of a window around the positions that cubic interpolation reads."""

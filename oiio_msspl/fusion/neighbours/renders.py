@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,7 @@ from oiio_msspl.fusion.checks.noise_level import has_clean_aovs
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
-from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
+from oiio_msspl.fusion.neighbours.trust import WHOLE, Judge, Light, cells, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import read_lrhs
@@ -59,7 +59,6 @@ class RenderPair:
 
     lr: ReadableRender
     hr: ReadableRender
-    _cells: list[Array] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def is_one_render(self) -> bool:
@@ -89,11 +88,10 @@ class RenderPair:
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], exact=True)[RGB]
         return _bounded(lrhs), high
 
-    def cells(self, light: Light) -> list[Array]:
-        """Return both :attr:`colours`, averaged to the cells of a light. They are kept for its other neighbours."""
-        if not self._cells:
-            self._cells.extend(light.cells(image) for image in self.colours)
-        return self._cells
+    @cached_property
+    def cells(self) -> list[Array]:
+        """Both :attr:`colours`, averaged to large cells."""
+        return [cells(image, self.alignment.scale, WHOLE) for image in self.colours]
 
     def halves(self, colours: Array) -> tuple[Array, Array]:
         """Return two pictures of the colours (h, w, 3) of one render whose noise is independent."""

@@ -15,9 +15,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from copy import copy
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,9 +27,9 @@ from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import grown, halved, max_3x3, means_around, sum_3x3, upsample_linear
 
-#: Side of the smallest cells that are judged, in HRLS pixels, unless LRHS pixels are larger; and side of the smallest
-#: that are judged over the whole frame, and not in bands of rows.
-CELL, COARSE = 4, 16
+#: Side of the smallest cells that are judged, in HRLS pixels, unless LRHS pixels are larger; and side of those from
+#: which the light of the whole frame is judged, and not of bands of rows.
+CELL, WHOLE = 4, 8
 #: Products are averaged over the cells up to these numbers of rows and columns away: the large square finds a faint
 #: change, the small one the edge of a change.
 REACHES = (3, 1)
@@ -64,6 +63,27 @@ LAMP = 3.0
 Judge = Callable[..., Array]
 
 
+class _Own(NamedTuple):
+    """A frame's own cells of one size."""
+
+    brightness: Array
+    """(h, w, 3): local brightness."""
+    noise: Array
+    """(h, w): variance of the mean of both renders, relative to the brightness."""
+    compared: Array
+    other: Array
+    """What neighbours are compared with, see :meth:`Light._compared`."""
+
+    def part(self, rows: slice) -> _Own:
+        """Return some rows of the cells."""
+        return _Own(*(plane[rows] for plane in self))
+
+    def halved(self) -> _Own:
+        """Return cells of twice the size."""
+        own = _Own(*map(halved, self))
+        return own._replace(noise=own.noise * np.float32(1 / 4))
+
+
 class Light(ABC):
     """The light of a frame over the alignment's grid.
 
@@ -77,44 +97,33 @@ class Light(ABC):
         self.alignment = alignment
         #: Luminance that is added to the local brightness.
         self.darkest = DARKEST * float(luminance(picture).mean(dtype=np.float64)) + 1e-30
-        #: How many times the grid is halved to get cells.
-        self._halvings = max(0, round(np.log2(CELL / alignment.scale)))
-        self.cell = alignment.scale << self._halvings
-        """Side of a cell, in HRLS pixels."""
-        self._steps = round(np.log2(COARSE / self.cell))
         brightness = sum_3x3(picture) * np.float32(1 / 9) + np.float32(self.darkest)
-        self._brightness = self.cells(brightness)
         bright = brightness if lrhs.shape[-1] == brightness.shape[-1] else luminance(brightness)[..., None]
-        self._noise = _noise(*(self.cells(image) for image in (lrhs, hrls, bright)))
-        self.noise = float(np.median(self._noise)) * 4**self._halvings
+        self._cell = max(CELL, alignment.scale)
+        noise = _noise(*(self._cells(image) for image in (lrhs, hrls, bright)))
+        brightness = self._cells(brightness)
+        self._own = _Own(brightness, noise, *self._compared(lrhs, hrls, picture, brightness))
+        self._coarse = self._own if self._cell == WHOLE else self._own.halved()
+        self.noise = float(np.median(noise)) * (self._cell // alignment.scale) ** 2
         """Variance of the mean of both renders in an LRHS pixel, relative to the light: the median of all."""
         hrls_noise = 2 * self.noise * alignment.scale**2
         self.moved_weight = np.float32(np.clip((hrls_noise - CLEAN) / (NOISY - CLEAN), 0, 1))
         """How much a neighbour that has moved counts, from 0 to 1."""
-        self.shape = self._noise.shape
-        """Rows and columns of cells."""
-        self._share = self.cell**2 / PIXELS_AVERAGED
+        self.shape = self._coarse.noise.shape
+        """Rows and columns of cells of ``WHOLE`` HRLS pixels."""
         lights = (image[..., 0] if image.shape[-1] == 1 else luminance(image) for image in (lrhs, hrls))
         self._least, self._most = _bounds(*lights)
 
-    def coarser(self) -> Self:
-        """Return the same light with cells of twice the size, for :meth:`coarse_trust`."""
-        light = copy(self)
-        light._halvings, light.cell = self._halvings + 1, self.cell * 2
-        light._steps, light._share = self._steps - 1, self._share * 4
-        light._brightness, light._noise = halved(self._brightness), halved(self._noise) * np.float32(1 / 4)
-        light.shape = light._noise.shape
-        return light
-
-    def cells(self, image: Array) -> Array:
-        """Average an image over the grid (h, w, ...) to cells."""
-        for _ in range(self._halvings):
-            image = halved(image)
-        return image
+    def _cells(self, image: Array) -> Array:
+        return cells(image, self.alignment.scale, CELL)
 
     @abstractmethod
-    def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
-        """Return two differences to a neighbour's cells (h, w, 3), and the deviation of their product (h, w)."""
+    def _compared(self, lrhs: Array, hrls: Array, picture: Array, brightness: Array) -> tuple[Array, Array]:
+        """Return the cells of a frame that those of neighbours are compared with, for :class:`_Own`."""
+
+    @abstractmethod
+    def _compare(self, neighbour: Sequence[Array], own: _Own, share: float) -> _Cells:
+        """Compare a neighbour's cells (h, w, 3) with the frame's. The ``share`` is for :class:`_Cells`."""
 
     def judge(self, area: Window, coarse: Sequence[Array]) -> Judge:
         """Return the function that judges the neighbours on one side, from the nearest to the farthest.
@@ -141,12 +150,13 @@ class Light(ABC):
     def _trust(self, neighbour: Sequence[Array], coarse: Array, rows: slice) -> Array:
         """Return how much one neighbour counts (h, w), over some rows of the grid."""
         height, width = neighbour[0].shape[:2]
-        parts = slice(rows.start >> self._halvings, -(-rows.stop >> self._halvings))
-        low, high, deviation = self._differences([self.cells(image) for image in neighbour], parts)
-        first = rows.start * self.alignment.scale // (COARSE // 2)
-        trust = _Cells(low, high, deviation, self._noise[parts], self._share).trust(self._steps - 1, coarse[first:])
-        if self._halvings:
-            trust = upsample_linear(trust, 1 << self._halvings)[:height, :width]
+        factor = self._cell // self.alignment.scale
+        own = self._own.part(slice(rows.start // factor, -(-rows.stop // factor)))
+        compared = self._compare([self._cells(image) for image in neighbour], own, self._cell**2 / PIXELS_AVERAGED)
+        first = rows.start * self.alignment.scale // WHOLE
+        trust = compared.trust(WHOLE // self._cell - 1, coarse[first:])
+        if factor > 1:
+            trust = upsample_linear(trust, factor)[:height, :width]
         lights = [luminance(image) for image in neighbour]
         least, most = _bounds(lights[0], lights[-1])
         lamps = self._least[rows] > np.float32(LAMP) * (most + np.float32(self.darkest))
@@ -157,77 +167,47 @@ class Light(ABC):
         return trust
 
     def coarse_trust(self, neighbour: Sequence[Array], valid: Mask) -> Array:
-        """Return how much a neighbour counts, 0 to 1, judged by cells of ``COARSE`` pixels and by larger ones.
+        """Return how much a neighbour counts, 0 to 1, judged by cells of twice ``WHOLE`` pixels and by larger ones.
 
         Args:
             neighbour: its colours (h, w, 3) at the places of the cells of the whole frame.
             valid: where it shows the same surface (h, w).
 
         Returns:
-            (h, w) over cells of half of ``COARSE`` pixels.
+            (h, w) over cells of ``WHOLE`` pixels.
         """
-        low, high, deviation = self._differences(neighbour, slice(None))
-        cells = _Cells(low * valid[..., None], high * valid[..., None], deviation, self._noise, self._share)
-        for _ in range(self._steps):
-            cells = cells.halved()
-        return upsample_linear(cells.trust(), 2)
+        compared = self._compare(neighbour, self._coarse, WHOLE**2 / PIXELS_AVERAGED)
+        shown = replace(compared, low=compared.low * valid[..., None], high=compared.high * valid[..., None])
+        return upsample_linear(shown.halved().trust(), 2)
 
 
 class RenderLight(Light):
-    """The light of a frame whose renders are averaged.
+    """The light of a frame whose renders are averaged: ``lrhs`` has colours (h, w, 3), and is the ``picture``, too."""
 
-    Args:
-        alignment: of the frame.
-        lrhs, hrls: colours of both renders (h, w, 3) over the grid.
-    """
+    def _compared(self, lrhs: Array, hrls: Array, picture: Array, brightness: Array) -> tuple[Array, Array]:
+        return self._cells(lrhs), self._cells(hrls)
 
-    def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array) -> None:
-        super().__init__(alignment, lrhs, hrls, lrhs)
-        self._renders = self.cells(lrhs), self.cells(hrls)
-
-    def coarser(self) -> Self:
-        """Return the same light with cells of twice the size."""
-        light = super().coarser()
-        light._renders = halved(self._renders[0]), halved(self._renders[1])
-        return light
-
-    def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
-        brightness = self._brightness[rows]
-        low, high = (
-            _limited((own[rows] - other) / brightness) for own, other in zip(self._renders, neighbour, strict=True)
-        )
-        others: Array = _noise(neighbour[0], neighbour[1], brightness)
-        return low, high, 2 * (self._noise[rows] + others)
+    def _compare(self, neighbour: Sequence[Array], own: _Own, share: float) -> _Cells:
+        low, high = (_limited((mine - other) / own.brightness) for mine, other in zip(own[2:], neighbour, strict=True))
+        others: Array = _noise(neighbour[0], neighbour[1], own.brightness)
+        return _Cells(low, high, 2 * (own.noise + others), own.noise, share)
 
 
 class ResultLight(Light):
-    """The light of a frame whose fused picture `F` is averaged.
+    """The light of a frame whose fused picture `F` is averaged. The renders have one channel, their luminance.
 
     A fused neighbour `W` is compared with it, because both lack the same detail. The frame's renders are the referees:
     (W - L) (W - H) - (F - L) (F - H) is by how much the squared error of `W` exceeds that of `F`.
-
-    Args:
-        alignment: of the frame.
-        lrhs, hrls: luminance of both renders (h, w) over the grid.
-        picture: colours of the fused frame (h, w, 3) over the grid.
     """
 
-    def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array, picture: Array) -> None:
-        super().__init__(alignment, lrhs[..., None], hrls[..., None], picture)
-        self._picture = self.cells(picture)
-        doubt = self.cells(2 * luminance(picture) - lrhs - hrls) / luminance(self._brightness)
-        #: 2 F - L - H, relative to the brightness.
-        self._doubt = _limited(doubt)[..., None]
+    def _compared(self, lrhs: Array, hrls: Array, picture: Array, brightness: Array) -> tuple[Array, Array]:
+        doubt = self._cells(2 * luminance(picture) - lrhs[..., 0] - hrls[..., 0]) / luminance(brightness)
+        return self._cells(picture), _limited(doubt)[..., None]  # F, and 2 F - L - H relative to the brightness
 
-    def coarser(self) -> Self:
-        """Return the same light with cells of twice the size."""
-        light = super().coarser()
-        light._picture, light._doubt = halved(self._picture), halved(self._doubt)
-        return light
-
-    def _differences(self, neighbour: Sequence[Array], rows: slice) -> tuple[Array, Array, Array]:
-        low = _limited((neighbour[0] - self._picture[rows]) / self._brightness[rows])
-        return low, low + self._doubt[rows], np.float32(2 * np.sqrt(2 * min(self._share, 1))) * self._noise[rows]
+    def _compare(self, neighbour: Sequence[Array], own: _Own, share: float) -> _Cells:
+        low = _limited((neighbour[0] - own.compared) / own.brightness)
+        deviation = np.float32(2 * np.sqrt(2 * min(share, 1))) * own.noise
+        return _Cells(low, low + own.other, deviation, own.noise, share)
 
 
 @dataclass(frozen=True)
@@ -272,6 +252,13 @@ class _Cells:
             )
             trust = np.clip(trust, least, most)
         return trust
+
+
+def cells(image: Array, scale: int, side: int) -> Array:
+    """Average an image over the grid (h, w, ...) to cells of ``side`` HRLS pixels; itself if its pixels are larger."""
+    for _ in range(round(np.log2(side / scale))):
+        image = halved(image)
+    return image
 
 
 def _noise(lrhs: Array, hrls: Array, brightness: Array) -> Array:

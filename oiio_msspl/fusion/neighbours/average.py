@@ -160,9 +160,9 @@ def _coarse_trust(light: Light, hops: Sequence[Hop[F]], cells_of: Callable[[F], 
     for hop in hops:
         path.follow(hop.there, hop.back, hop.frame.alignment.hr_data_window)
         # Cells count from the corner of each frame's grid.
-        (to_x, to_y), here, there = path.positions(slice(None)), alignment.grid, hop.frame.alignment.grid
-        at_x = columns + (to_x - x + np.float32((here.x0 - there.x0) * alignment.scale)) / np.float32(WHOLE)
-        at_y = rows + (to_y - y + np.float32((here.y0 - there.y0) * alignment.scale)) / np.float32(WHOLE)
+        here, there = alignment.grid, hop.frame.alignment.grid
+        at_x = columns + (path.x - x + np.float32((here.x0 - there.x0) * alignment.scale)) / np.float32(WHOLE)
+        at_y = rows + (path.y - y + np.float32((here.y0 - there.y0) * alignment.scale)) / np.float32(WHOLE)
         colours = [sample_linear(image, at_x, at_y) for image in cells_of(hop.frame)]
         result.append(light.coarse_trust(colours, path.valid))
     return result

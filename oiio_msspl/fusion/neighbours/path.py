@@ -44,19 +44,16 @@ class Path:
         self._area, self._start, self._end = area, window, window
         #: How many hops were followed.
         self.hops = 0
-        #: Positions (h, w) in pixels; None for the pixel itself.
-        self.x: Array | None = None
-        self.y: Array | None = None
-        #: Flat indices (h, w) of the nearest pixels in the data window of the last frame; None with ``x``.
+        #: Positions (h, w) in pixels, not to be changed.
+        self.x, self.y = pixel_positions(area) if pixels is None else pixels
+        #: Flat indices (h, w) of the nearest pixels in the data window of the last frame; None for the area itself.
         self.nearest: NDArray[np.intp] | None = None
+        if pixels is not None:
+            self.nearest = nearest_indices(self.x - window.x0, self.y - window.y0, (window.height, window.width))
         #: Where the last frame shows the same surface (h, w).
-        self.valid: Mask = np.ones((area.height, area.width), bool)
+        self.valid: Mask = np.ones(self.x.shape, bool)
         #: Where an object has moved that is not followed (h, w); None if nothing has.
         self.moved_objects: Mask | None = None
-        if pixels is not None:
-            self.x, self.y = x, y = pixels
-            self.nearest = nearest_indices(x - window.x0, y - window.y0, (window.height, window.width))
-            self.valid = np.ones(x.shape, bool)
 
     def follow(self, there: Motion, back: Motion, window: Window) -> None:
         """Go on to the next frame, whose data window is ``window``, by the motion to it and the way back."""
@@ -72,7 +69,7 @@ class Path:
             if there.known is not None:
                 good &= self._values(there.known, rows, start)
             vector = None if vectors is None else self._values(vectors, rows, start)
-            from_x, from_y = self.positions(rows)
+            from_x, from_y = self.x[rows], self.y[rows]
             x, y = (from_x, from_y) if vector is None else (from_x + vector.real, from_y + vector.imag)
             # False for NaN, too. Pixels that leave the window stay where they are.
             good &= (x > window.x0 - 0.5) & (x < window.x1 - 0.5) & (y > window.y0 - 0.5) & (y < window.y1 - 0.5)
@@ -105,20 +102,12 @@ class Path:
         """Return values over a data window at flat indices; at these rows of the area if there are none."""
         if indices is not None:
             return values.reshape(-1).take(indices, mode="clip")  # a check of all indices takes as long as to take them
-        return values[self._rows(rows).slices(self._start)]
-
-    def positions(self, rows: slice) -> tuple[Array, Array]:
-        """Return the positions of some rows, x and y, (n, w) each; they are not to be changed."""
-        if self.x is not None and self.y is not None:
-            return self.x[rows], self.y[rows]
-        return pixel_positions(self._rows(rows))
-
-    def _rows(self, rows: slice) -> Window:
-        return replace(self._area, y0=self._area.y0 + rows.start, y1=self._area.y0 + rows.stop)
+        area = replace(self._area, y0=self._area.y0 + rows.start, y1=self._area.y0 + rows.stop)
+        return values[area.slices(self._start)]
 
     def place_in(self, window: Window) -> Window:
         """Return the rows of a window around the positions that cubic interpolation reads."""
-        if self.y is None:
+        if self.nearest is None:
             return self._area
         low, high = int(np.floor(self.y.min())) - 2, int(np.ceil(self.y.max())) + 3
         top = min(max(low, window.y0), window.y1 - 1)

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -180,10 +180,10 @@ class RenderBand:
     def add(self, hop: Hop[RenderPair], path: Path, judge: Judge) -> None:
         """Add the renders of a neighbour that a path leads to."""
         neighbour, alignment, area = hop.frame, self._alignment, self._area
-        high = _Nearest(neighbour, path, self._names)
-        valid = high.finite & path.valid
+        high, finite = _nearest(neighbour, path, self._names)
+        valid = finite & path.valid
         share = to_grid(alignment, valid.astype(np.float32), area)
-        colours = high.pixels(RGB, slice(None))
+        colours = high(RGB, slice(None))
         hrls = to_grid(alignment, _bounded(colours) * valid[..., None], area)
         hrls = np.where(share[..., None] >= COVERED, hrls / np.maximum(share, 1e-6)[..., None], self._mean_colours)
         if self._low is None:
@@ -193,7 +193,7 @@ class RenderBand:
             usable &= _make_finite(low)
             lrhs = self._in_grid(_bounded(low[RGB]), usable, neighbour.alignment.stretch)
         counted = judge(lrhs, hrls)
-        if path.x is not None:
+        if path.nearest is not None:
             counted = counted * self._light.moved_weight
         if path.moved_objects is not None:
             counted = counted * self._far_from(path.moved_objects)
@@ -205,10 +205,10 @@ class RenderBand:
 
         def pixels(name: str, rows: slice) -> Array:
             inside = slice(top + rows.start, top + rows.stop)
-            values = colours[inside] if name == RGB else high.pixels(name, inside)
+            values = colours[inside] if name == RGB else high(name, inside)
             if name != RGB or self._albedo is None or path.nearest is None:
                 return values
-            return values * _ratio(self._albedo[rows], high.pixels(ALBEDO, inside))
+            return values * _ratio(self._albedo[rows], high(ALBEDO, inside))
 
         self._high.add(pixels, weight[self._rows])
         if self._low is not None:
@@ -258,7 +258,9 @@ class RenderBand:
         pixels = _with_finite_passes(read(neighbour.lr, place, self._low_names))
         x, y = x - place.x0, y - place.y0
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
-        moves = path.x is not None and self._alignment.scale > ONE_SIZE  # a render of full size has noise to remove
+        moves = (
+            path.nearest is not None and self._alignment.scale > ONE_SIZE
+        )  # a render of full size has noise to remove
         smooth = [name for name in pixels if moves and (name in light or is_light_of_pass(name))]
         features = {}
         if smooth:
@@ -271,7 +273,7 @@ class RenderBand:
     def _low_positions(self, path: Path, valid: Mask, share: Array) -> tuple[Array, Array]:
         """Return where the grid pixels are in the neighbour: they move as their HRLS pixels do on average."""
         x, y = pixel_positions(self._grid)
-        if path.x is None or path.y is None:
+        if path.nearest is None:
             return x, y
         pixels = np.maximum(share, 1e-6) * np.float32(self._alignment.scale)
         moved_x, moved_y = (
@@ -281,30 +283,24 @@ class RenderBand:
         return x + moved_x, y + moved_y
 
 
-class _Nearest:
-    """A neighbour's HRLS at the pixels that are nearest to the positions of a path. Pixels that are not finite are 0.
+def _nearest(neighbour: RenderPair, path: Path, names: Sequence[str]) -> tuple[Callable[[str, slice], Array], Mask]:
+    """Read a neighbour's HRLS at the pixels that are nearest to the positions of a path.
 
-    Attributes:
-        finite: where all features are finite, (h, w), if the path is valid there.
+    Returns:
+        A function of a feature and rows to its pixels (n, w, c), not to be changed: 0 where they are not finite; and
+        where all features are finite, (h, w), if the path is valid there.
     """
-
-    def __init__(self, neighbour: RenderPair, path: Path, features: Sequence[str]) -> None:
-        window = neighbour.alignment.hr_data_window
-        place = path.place_in(window)
-        self._images = _with_finite_passes(read(neighbour.hr, place, features))
-        self.finite = finite = _make_finite(self._images)
-        #: Flat indices in the data window; the images begin at ``_first``.
-        self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
-        if path.nearest is not None:
-            # Copies of all indices take memory, and broken pixels are rare.
-            self.finite = path.valid if finite.all() else finite.take(path.nearest - self._first)
-            self._planes = {name: _flat_planes(values) for name, values in self._images.items()}
-
-    def pixels(self, name: str, rows: slice) -> Array:
-        """Return a feature at some rows (n, w, c), not to be changed."""
-        if self._nearest is None:
-            return np.asarray(self._images[name][rows])
-        return _take(self._planes[name], self._nearest[rows] - self._first)
+    window, nearest = neighbour.alignment.hr_data_window, path.nearest
+    place = path.place_in(window)
+    images = _with_finite_passes(read(neighbour.hr, place, names))
+    finite = _make_finite(images)
+    if nearest is None:
+        return lambda name, rows: images[name][rows], finite
+    planes = {name: _flat_planes(image) for name, image in images.items()}
+    # Copies of all indices take memory, and broken pixels are rare.
+    first = (place.y0 - window.y0) * window.width
+    finite = path.valid if finite.all() else finite.take(nearest - first)
+    return lambda name, rows: _take(planes[name], nearest[rows] - first), finite
 
 
 def _ratio(own: Array, other: Array) -> Array:

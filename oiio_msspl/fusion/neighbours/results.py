@@ -62,7 +62,7 @@ class ResultBand:
         warped = _warp(hop.frame, path)
         picture = to_grid(alignment, np.where(path.valid[..., None], warped[RGB], self._own[RGB]), area)
         weight = from_grid(alignment, judge(picture), area) * path.valid
-        if path.x is not None:
+        if path.nearest is not None:
             weight *= self._light.moved_weight
         if self._company is not None:
             weight *= self._company
@@ -94,14 +94,10 @@ def _warp(frame: FusedFrame, path: Path) -> Images:
     """Interpolate colour and alpha of a neighbour at the valid positions of a path, (h, w, c) each."""
     place = path.place_in(frame.alignment.hr_data_window)
     images = images_of(frame, place)
-    if path.x is None:
+    if path.nearest is None:
         return images
-
-    def positions(rows: slice) -> tuple[Array, Array]:
-        x, y = path.positions(rows)
-        return x - place.x0, y - place.y0
-
-    warped = sample_cubic(list(images.values()), positions, path.valid.shape, path.valid)
+    values, shape = list(images.values()), path.valid.shape
+    warped = sample_cubic(values, lambda rows: (path.x[rows] - place.x0, path.y[rows] - place.y0), shape, path.valid)
     return dict(zip(images, warped, strict=True))
 
 

@@ -280,15 +280,12 @@ def _bounds(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
 
 
 def likeness(own: Array, other: Array, darkest: float, half: float, *, steep: bool = False) -> Array:
-    """Return how much pixels of two luminances count for each other: 1 if equal, 0.5 at a difference of ``half``."""
-    with np.errstate(over="ignore"):
-        squares = np.square(relative_difference(own, other, darkest) / np.float32(half))
-        return np.asarray(1 / (1 + (np.square(squares) if steep else squares)), np.float32)
+    """Return how much pixels of two luminances count for each other: 1 if equal, 0.5 at a difference of ``half``.
 
-
-def relative_difference(own: Array, other: Array, darkest: float) -> Array:
-    """Return the difference of two luminances of at least ``darkest``, divided by the root of their product."""
+    The difference is divided by the root of their product. Both count as at least ``darkest``.
+    """
     own, other = (np.maximum(values, np.float32(darkest)) for values in (own, other))
     with np.errstate(over="ignore", under="ignore", divide="ignore"):  # the product could overflow, as the ratio may
         ratio = np.sqrt(own / other)
-        return np.asarray(ratio - 1 / ratio, np.float32)
+        squares = np.square((ratio - 1 / ratio) / np.float32(half))
+        return np.asarray(1 / (1 + (np.square(squares) if steep else squares)), np.float32)

@@ -10,7 +10,7 @@ from oiio_msspl.fusion.motion.shot import ROUND_TRIP, ROUND_TRIP_OF_FLOW
 from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.fusion.neighbours import bands
 from oiio_msspl.fusion.neighbours.average import average_results
-from oiio_msspl.fusion.neighbours.trust import relative_difference
+from oiio_msspl.fusion.neighbours.trust import likeness
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import box_downsample
@@ -249,9 +249,9 @@ def test_bands_of_rows_agree(monkeypatch, alpha):
 
 def test_differences_of_any_brightness_are_relative():
     own, other = np.float32([1, 4, 0, 3e38, 3e38, 0]), np.float32([1, 1, 0, 1.5e38, 0, 3e38])
-    found = relative_difference(own, other, 1e-20)
-    np.testing.assert_allclose(found[:4], [0, 1.5, 0, np.sqrt(0.5)], rtol=1e-5)
-    assert found[4] > 1e18 and found[5] < -1e18
+    for steep in (False, True):
+        squares = np.float64([0, 1.5, 0, np.sqrt(0.5), np.inf, np.inf]) ** (4 if steep else 2)
+        np.testing.assert_allclose(likeness(own, other, 1e-20, 1, steep=steep), 1 / (1 + squares), rtol=1e-5)
 
 
 @pytest.mark.parametrize("lights", [(1.5, 1.5, 1.5), (0.9, 0.9, 0.9), (1, 1, 1.5), (1.3, 0.92, 0.7)])

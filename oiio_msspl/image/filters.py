@@ -165,11 +165,9 @@ def in_squares(whole: Mask, partly: Mask, side: int, fraction: float) -> Mask:
     """
     if min(whole.shape) < side or not whole.any():
         return np.zeros_like(whole)
-    windows = np.lib.stride_tricks.sliding_window_view
-    squares = windows(windows(whole, side, 0).all(axis=-1), side, 1).all(axis=-1)
-    counts = windows(windows(partly, side, 0).sum(axis=-1, dtype=np.int32), side, 1).sum(axis=-1)
-    squares = np.pad(squares & (counts >= fraction * side**2), side - 1)
-    return np.asarray(windows(windows(squares, side, 0).any(axis=-1), side, 1).any(axis=-1))
+    in_whole, in_partly = (_window_sums(mask.astype(np.int32), side) for mask in (whole, partly))
+    squares = (in_whole == side**2) & (in_partly >= fraction * side**2)
+    return _window_sums(np.pad(squares.astype(np.int32), side - 1), side) > 0
 
 
 def max_3x3(values: Array) -> Array:
@@ -217,18 +215,20 @@ def _sum_of_three(values: Array, axis: int, weight: int) -> Array:
     return total.swapaxes(0, axis)
 
 
-def _window_sums(values: Array, size: int, axis: int) -> Array:
-    """Return the sums of all windows of ``size`` lines along an axis, one for each that lies inside (n - size + 1)."""
-    lines = values.swapaxes(0, axis)
-    count, width, start = len(lines) - size + 1, 1, 0
-    parts = []  # a window consists of windows whose widths are powers of 2
-    while start < size:
-        if size & width:
-            parts.append(lines[start : start + count])
-            start += width
-        if start < size:
-            lines, width = lines[width:] + lines[:-width], 2 * width
-    return reduce(np.add, parts).swapaxes(0, axis)
+def _window_sums(values: NDArray[Any], size: int) -> NDArray[Any]:
+    """Return the sums of all squares of ``size`` x ``size`` values that lie inside, (h - size + 1, w - size + 1)."""
+    for axis in (0, 1):
+        lines = values.swapaxes(0, axis)
+        count, width, start = len(lines) - size + 1, 1, 0
+        parts = []  # a window consists of windows whose widths are powers of 2
+        while start < size:
+            if size & width:
+                parts.append(lines[start : start + count])
+                start += width
+            if start < size:
+                lines, width = lines[width:] + lines[:-width], 2 * width
+        values = reduce(np.add, parts).swapaxes(0, axis)
+    return values
 
 
 def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
@@ -246,9 +246,7 @@ def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
         padded[first : first + bottom - top, most : most + width] = plane[top:bottom]
         for reach, result in zip(reaches, results, strict=True):
             rest = most - reach
-            sums = padded[rest : len(padded) - rest, rest : width + 2 * most - rest]
-            for axis in (0, 1):
-                sums = _window_sums(sums, 2 * reach + 1, axis)
+            sums = _window_sums(padded[rest : len(padded) - rest, rest : width + 2 * most - rest], 2 * reach + 1)
             lines, columns = (
                 (np.minimum(places + reach + 1, size) - np.maximum(places - reach, 0)).astype(np.float32)
                 for places, size in ((np.arange(rows.start, rows.stop), height), (np.arange(width), width))

@@ -50,7 +50,9 @@ def find_projection(render: MappedRender) -> Projection | None:
 
     None if there are none, or none fits.
     """
-    if not render.motion.position or not _attributes(render):
+    names = [name for known in MATRICES for name in render.metadata if name.lower() == known]
+    matrices = {name: matrix for name in names if (matrix := _matrix(render, name)) is not None}
+    if not render.motion.position or not matrices:
         return None
     window = render.data_window
     positions = render.file.read(render.motion.position, window)
@@ -61,13 +63,7 @@ def find_projection(render: MappedRender) -> Projection | None:
     chosen = np.linspace(0, len(x) - 1, min(len(x), SAMPLES)).astype(np.int64)
     points = positions[y[chosen], x[chosen]]
     pixels = np.stack([x[chosen] + window.x0, y[chosen] + window.y0], axis=-1).astype(np.float32)
-    fits = (_fit(attribute, _matrix(render, attribute), points, pixels) for attribute in _attributes(render))
-    return next(filter(None, fits), None)
-
-
-def _attributes(render: MappedRender) -> list[str]:
-    """Return the attributes of the header that may hold a matrix, the likeliest first."""
-    return [attribute for name in MATRICES for attribute in render.metadata if attribute.lower() == name]
+    return next(filter(None, (_fit(name, matrix, points, pixels) for name, matrix in matrices.items())), None)
 
 
 def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Projection) -> tuple[Array, Mask]:
@@ -107,10 +103,8 @@ def _matrix(render: MappedRender, attribute: str) -> NDArray[np.float32] | None:
     return values if np.isfinite(values).all() else None
 
 
-def _fit(attribute: str, matrix: NDArray[np.float32] | None, points: Array, pixels: Array) -> Projection | None:
+def _fit(attribute: str, matrix: NDArray[np.float32], points: Array, pixels: Array) -> Projection | None:
     """Fit the scale and shift with which a matrix projects points (n, 3) onto pixels (n, 2); None if it does not."""
-    if matrix is None:
-        return None
     seen = points @ matrix[:3] + matrix[3]
     divisor = 2 if np.allclose(matrix[:, 3], (0, 0, 0, 1)) else 3
     if np.abs(seen[:, divisor]).min() < 1e-9:

@@ -46,6 +46,7 @@ class ShotMotion:
 
     def __init__(self, source: MotionSource) -> None:
         self._source = source
+        self._tolerance = ROUND_TRIP_OF_FLOW if source.kind == FLOW else ROUND_TRIP
         #: By the numbers of two frames: forwards and backwards; or why the vectors can't be believed.
         self._motions: dict[tuple[int, int], tuple[Motion, Motion] | str] = {}
 
@@ -97,10 +98,6 @@ class ShotMotion:
             return there, there
         objects = source.moved_objects(second, first, back, back_known) if back_known.any() else None
         return there, self._motion(back, back_known, objects, back_borders)
-
-    @property
-    def _tolerance(self) -> float:
-        return ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP
 
     def _borders(self, vectors: Array) -> Mask | None:
         """Find the borders of surfaces (h, w) by vectors; None if these are 0 everywhere."""

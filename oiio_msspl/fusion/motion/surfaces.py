@@ -111,13 +111,8 @@ def misleads(here: ReadableRender, there: ReadableRender, names: Sequence[str], 
 
 def _means_at(image: Array, x: Array, y: Array) -> Array:
     """Return the means (n, c) of the 3 x 3 pixels around positions (n); NaN and infinities count as 0."""
-    height, width = image.shape[:2]
-    around = np.stack(
-        [
-            nearest_indices(np.clip(x + column, 0, width - 1), np.clip(y + row, 0, height - 1), (height, width))
-            for row, column in itertools.product((-1, 0, 1), repeat=2)
-        ]
-    )
+    steps = itertools.product((-1, 0, 1), repeat=2)
+    around = np.stack([nearest_indices(x + column, y + row, image.shape[:2]) for row, column in steps])
     # An image may be stored in planes, and reshaping it would copy all of it.
     return np.stack([_finite(plane.ravel().take(around)).mean(axis=0) for plane in planes_of(image)], axis=-1)
 

@@ -194,7 +194,8 @@ class _Trial:
     """Compares the guides of two frames as formats bring them to each other."""
 
     def __init__(self, frames: TwoFrames, stored: tuple[Array, Array], offset: float) -> None:
-        self._size = (frames.first.display_window.width, frames.first.display_window.height)
+        frame = frames.renders[0].display_window
+        self._size = frame.width, frame.height
         self._reduction = frames.reduction
         places = (_place(guide, frame, stored[frame], offset) for guide in frames.guides for frame in (0, 1))
         self.places = [place for place in places if place]

@@ -52,8 +52,7 @@ class Guide:
 class TwoFrames:
     """Two frames of a shot, over the window that both have."""
 
-    first: MappedRender
-    second: MappedRender
+    renders: tuple[MappedRender, MappedRender]
     window: Window
     reduction: int
     """Every pixel here is the mean of ``reduction`` x ``reduction`` pixels of the frames."""
@@ -61,8 +60,7 @@ class TwoFrames:
 
     def read(self, frame: int, channels: Sequence[Channel]) -> Array:
         """Read channels of a frame (0 or 1), reduced as the guides are."""
-        render = (self.first, self.second)[frame]
-        return reduced(partial(render.file.read, channels), self.window, self.reduction)
+        return reduced(partial(self.renders[frame].file.read, channels), self.window, self.reduction)
 
 
 def open_frames(first: MappedRender, second: MappedRender, rows: int | None = None) -> TwoFrames:
@@ -77,16 +75,15 @@ def open_frames(first: MappedRender, second: MappedRender, rows: int | None = No
     Raises:
         InputError: pixels can't be decoded.
     """
-    window = first.data_window.intersect(second.data_window)
+    renders, window = (first, second), first.data_window.intersect(second.data_window)
     if not window.width or not window.height:
-        return TwoFrames(first, second, window, 1, ())
+        return TwoFrames(renders, window, 1, ())
     if rows is not None and window.height > rows:
         top = window.y0 + (window.height - rows) // 2
         window = Window(window.x0, top, window.x1, top + rows)
     reduction = 1
     while window.width * window.height > MAX_PIXELS * reduction**2:
         reduction += 1
-    renders = (first, second)
     names = [name for name in (ALBEDO, NORMAL) if all(has_guide(render, name) for render in renders)]
     with_position = all(render.motion.position for render in renders)
 
@@ -106,7 +103,7 @@ def open_frames(first: MappedRender, second: MappedRender, rows: int | None = No
 
     of_first, of_second = in_parallel(*(partial(images, render) for render in renders))
     guides = tuple(Guide(name, (image, of_second[name])) for name, image in of_first.items())
-    return TwoFrames(first, second, window, reduction, guides)
+    return TwoFrames(renders, window, reduction, guides)
 
 
 def has_guide(render: MappedRender, name: str, *, moves: bool = True) -> bool:

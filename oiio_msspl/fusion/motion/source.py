@@ -16,7 +16,7 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.aovs.motion import MotionField, user_fields
+from oiio_msspl.aovs.motion import MotionField, MotionFormat, user_fields
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender, Render
@@ -211,18 +211,18 @@ def find_motion(
         InputError: pixels can't be decoded; ``wanted`` can't be read or does not fit; or, if ``required``, nothing is
             known of the movement.
     """
-    source = _find(first, second, wanted, {field.name: field for field in verified})
+    frames = open_frames(first, second)
+    source = MotionSource(NONE, f"its data window and that of {second.name} have no common part")
+    if frames.window.width and frames.window.height:
+        source = _by_pixels(frames, wanted, {field.name: field.format for field in verified})
     if required and source.kind == NONE:
         raise InputError(f"{first.name}: {source.text}")
     return source
 
 
-def _find(
-    first: MappedRender, second: MappedRender, wanted: str | None, verified: Mapping[str, MotionField]
-) -> MotionSource:
-    frames = open_frames(first, second)
-    if not frames.window.width or not frames.window.height:
-        return MotionSource(NONE, f"its data window and that of {second.name} have no common part")
+def _by_pixels(frames: TwoFrames, wanted: str | None, verified: Mapping[str, MotionFormat]) -> MotionSource:
+    """Find out by the pixels that frames share. Layers are ``verified`` by name."""
+    first = frames.renders[0]
     fields = first.motion.fields if wanted is None else user_fields(first.motion, wanted, first.name)
     checks = _checks(frames, fields, verified)
     # Layers of which nothing is known count only if the pixels show that they are vectors.
@@ -237,22 +237,24 @@ def _find(
     return source
 
 
-def _checks(frames: TwoFrames, fields: Sequence[MotionField], verified: Mapping[str, MotionField]) -> list[FieldCheck]:
+def _checks(frames: TwoFrames, fields: Sequence[MotionField], verified: Mapping[str, MotionFormat]) -> list[FieldCheck]:
     """Verify layers by the pixels of both frames."""
+    fields = [replace(field, format=verified.get(field.name, field.format)) for field in fields]
     first, second = in_parallel(*(partial(_stored, frames, index, fields) for index in (0, 1)))
-    stored = {name: (first[name], second[name]) for name in first.keys() & second.keys()}
-    checks = (_check(frames, field, stored.get(field.name), verified.get(field.name)) for field in fields)
-    return [_try_premultiplied(frames, check) for check in checks]
+    checks = []
+    for field in fields:
+        if field.name in first and field.name in second:
+            stored = first[field.name], second[field.name]
+            check = _check(frames, field, stored, verified=field.name in verified)
+            checks.append(_try_premultiplied(frames, check, stored))
+        else:
+            checks.append(FieldCheck(field, f"{frames.renders[1].name} lacks it"))
+    return checks
 
 
-def _check(
-    frames: TwoFrames, field: MotionField, stored: tuple[Array, Array] | None, verified: MotionField | None
-) -> FieldCheck:
+def _check(frames: TwoFrames, field: MotionField, stored: tuple[Array, Array], *, verified: bool) -> FieldCheck:
     """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
-    field = replace(field, format=verified.format) if verified else field
-    if stored is None:
-        return FieldCheck(field, f"{frames.second.name} lacks it")
-    check = check_field(frames, field, stored, verified=verified is not None)
+    check = check_field(frames, field, stored, verified=verified)
     if check.zero or not {"to", "x", "y", "unit"} <= field.fixed:
         return check
     other = check_field(frames, replace(field, fixed=frozenset({"to"})), stored)
@@ -262,52 +264,47 @@ def _check(
     return replace(check, problem="", by_user=True) if check.problem and check.fit <= 1 else check
 
 
-def _try_premultiplied(frames: TwoFrames, check: FieldCheck) -> FieldCheck:
-    """Return the verdict on vectors that are multiplied by alpha, if they fit better where alpha is neither 0 nor 1.
-
-    Elsewhere they are the same.
-    """
-    field, alphas = check.field, (frames.first.alpha, frames.second.alpha)
-    if check.zero or field.format.premultiplied or not all(alphas):
+def _try_premultiplied(frames: TwoFrames, check: FieldCheck, stored: tuple[Array, Array]) -> FieldCheck:
+    """Return the verdict on vectors that are multiplied by alpha, if they fit better where alpha is neither 0 nor 1."""
+    field, alphas = check.field, [render.alpha for render in frames.renders if render.alpha]
+    if check.zero or field.format.premultiplied or len(alphas) < 2:
+        return check
+    first, second = (frames.read(index, [alpha]) for index, alpha in enumerate(alphas))
+    part, other_part = ((cover > 0) & (cover < 1) for cover in (first, second))
+    if min(np.count_nonzero(part), np.count_nonzero(other_part)) < FEWEST:
         return check
     multiplied = replace(field, format=replace(field.format, premultiplied=True))
-    covers = [frames.read(index, [alpha]) for index, alpha in enumerate(alphas) if alpha]
-    parts = [(cover > 0) & (cover < 1) for cover in covers]
-    if min(np.count_nonzero(part) for part in parts) < FEWEST:
-        return check
-    as_stored, divided = (
-        [values for index in (0, 1) for values in _stored(frames, index, [form]).values()]
-        for form in (field, multiplied)
-    )
-    if len(divided) < len(covers):
-        return check
+    divided = _divided(stored[0], first), _divided(stored[1], second)
     none = np.float32(np.nan)
-    there = [
-        check_field(frames, form, (np.where(parts[0], first, none), np.where(parts[1], second, none)))
-        for form, (first, second) in ((field, as_stored), (multiplied, divided))
-    ]
-    if there[1].problem or (not there[0].problem and there[1].fit * MARGIN >= there[0].fit):
+    as_stored, as_divided = (
+        check_field(frames, form, (np.where(part, one, none), np.where(other_part, two, none)))
+        for form, (one, two) in ((field, stored), (multiplied, divided))
+    )
+    if as_divided.problem or (not as_stored.problem and as_divided.fit * MARGIN >= as_stored.fit):
         return check
-    return check_field(frames, multiplied, (divided[0], divided[1]))
+    return check_field(frames, multiplied, divided)
+
+
+def _divided(vectors: Array, alpha: Array) -> Array:
+    """Divide vectors (h, w, 2) by alpha (h, w, 1); 0 where it is 0."""
+    return np.where(alpha > 0, vectors / np.where(alpha > 0, alpha, 1), 0).astype(np.float32)
 
 
 def _stored(frames: TwoFrames, index: int, fields: Sequence[MotionField]) -> dict[str, Array]:
     """Read the stored vectors (h, w, 2) of a frame, by layer, not multiplied by alpha. It may lack some layers."""
-    render = (frames.first, frames.second)[index]
-    channels_of = ((field, render.motion.channels(field.layer, field.components)) for field in fields)
-    layers = {field: channels for field, channels in channels_of if channels is not None}
+    render = frames.renders[index]
+    found = ((field, render.motion.channels(field.layer, field.components)) for field in fields)
+    layers = [(field, channels) for field, channels in found if channels]
     if not layers:
         return {}
-    alpha = [render.alpha] if render.alpha and any(field.format.premultiplied for field in layers) else []
-    names = [*dict.fromkeys(channel for channels in layers.values() for channel in channels), *alpha]
+    alpha = [render.alpha] if render.alpha and any(field.format.premultiplied for field, _ in layers) else []
+    names = [*dict.fromkeys(channel for _, channels in layers for channel in channels), *alpha]
     pixels = frames.read(index, names)  # one read, because layers of a part are decoded together
     result = {}
-    for field, channels in layers.items():
-        stored = np.stack([pixels[..., names.index(channel)] for channel in channels], axis=-1)
+    for field, channels in layers:
+        result[field.name] = np.stack([pixels[..., names.index(channel)] for channel in channels], axis=-1)
         if field.format.premultiplied and alpha:
-            cover = pixels[..., -1:]
-            stored = np.where(cover > 0, stored / np.where(cover > 0, cover, 1), 0).astype(np.float32)
-        result[field.name] = stored
+            result[field.name] = _divided(result[field.name], pixels[..., -1:])
     return result
 
 
@@ -329,12 +326,12 @@ def _without_vectors(frames: TwoFrames, checks: Sequence[FieldCheck]) -> MotionS
         if unclear := [check for check in checks if not check.zero]:
             rest = f"; what moves is not followed: {_problems(unclear)} (describe it with --motion-format)"
         return MotionSource(STATIC, f"the camera stands still{rest}", tuple(check.field for check in checks))
-    guesses = ", ".join(field.name for field in frames.first.motion.guesses)
+    guesses = ", ".join(field.name for field in frames.renders[0].motion.guesses)
     unknown = f" (by the pixels {guesses} holds none)" if guesses else ""
     seen = f"{_problems(checks)}; " if checks else f"no motion vectors{unknown}; "
     if checks and all(check.zero for check in checks) and moved.any():
         seen = f"{_problems(checks)}, though the picture moves (Cycles writes zeros if motion blur is on); "
-    if projection := find_projection(frames.first):
+    if projection := find_projection(frames.renders[0]):
         seen += f"the camera's matrix {projection.attribute} and positions say where everything goes that stands still"
         return MotionSource(CAMERA, seen, projection=projection)
     if any(not check.zero for check in checks):

@@ -85,19 +85,18 @@ class ShotMotion:
         if source.misleads(first, second, forth, known):
             return "do not lead to the same surfaces"
         objects = source.moved_objects(first, second, forth, known) if known.any() else None
+        back_objects = objects
         if objects is not None and source.kind == VECTORS:
             # Pixels are followed there and back, so one direction tells both. Where the way back leads elsewhere, the
             # surface is only hidden.
             if borders is not None:
                 objects &= ~grown(borders, BESIDE_BORDERS)
             hidden = objects & ~_leads_back(objects, forth, back, first.hr.data_window, second.hr.data_window)
-            there = self._motion(forth, known & ~hidden, objects & ~hidden, borders)
-            return there, self._motion(back, back_known, None, back_borders)
+            objects, known, back_objects = objects & ~hidden, known & ~hidden, None
+        elif not same:
+            back_objects = source.moved_objects(second, first, back, back_known) if back_known.any() else None
         there = self._motion(forth, known, objects, borders)
-        if same:
-            return there, there
-        objects = source.moved_objects(second, first, back, back_known) if back_known.any() else None
-        return there, self._motion(back, back_known, objects, back_borders)
+        return there, there if same else self._motion(back, back_known, back_objects, back_borders)
 
     def _borders(self, vectors: Array) -> Mask | None:
         """Find the borders of surfaces (h, w) by vectors; None if these are 0 everywhere."""

@@ -59,8 +59,8 @@ def fuse_alone(
     with limit_threads(session.threads), pair.hr.cache_strips(cache_bytes):
         own = FramePair(pair.lr, pair.hr, alignment, session.contract, share=share)
         error: Array | None = None if frame.error is None else blank(frame.error.shape)
-        result = FusedPixels(blank(frame.rgb.shape), None, error, alignment, own.exposure)
-        result.trust = None if frame.trust is None else frame.trust.copy()
+        trust = None if frame.trust is None else frame.trust.copy()
+        result = FusedPixels(blank(frame.rgb.shape), None, error, alignment, own.exposure, trust=trust)
         # Tiles begin at multiples of the contract's alignment, which is no more than the overlap: none meets another.
         boxes = _boxes(places, 2 * session.contract.overlap)
         tiles = [tile for box in boxes for tile in own.tiles(box.shift(alignment.grid.x0, alignment.grid.y0))]
@@ -73,8 +73,8 @@ def fuse_alone(
                     unload(image)
                     unload(new)
             del task  # or its memory would be held while the next one is fused
-        if frame.trust is not None and result.trust is not None:
-            frame.trust += alone * (result.trust - frame.trust)
+        if frame.trust is not None and trust is not None:
+            frame.trust += alone * (trust - frame.trust)
     session.release_memory()
     frame.seconds += session.seconds - seconds
 
@@ -90,9 +90,7 @@ def _boxes(places: Mask, gap: int) -> Iterator[Window]:
     for axis, used in enumerate((rows, columns)):
         starts = used[1:][np.diff(used) > gap]
         if len(starts):
-            before, after = np.split(places, starts[:1], axis)
-            yield from _boxes(before, gap)
-            dx, dy = (0, starts[0]) if axis == 0 else (starts[0], 0)
-            yield from (box.shift(dx, dy) for box in _boxes(after, gap))
+            for start, part in zip((0, *starts), np.split(places, starts, axis), strict=True):
+                yield from (box.shift(start * axis, start * (1 - axis)) for box in _boxes(part, gap))
             return
     yield Window(columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.fusion.tiles.features import mirrored
+from oiio_msspl.fusion.tiles.features import in_hrls_pixels, mirrored
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import box_downsample, upsample_linear
 from oiio_msspl.image.parallel import two_at_a_time
@@ -65,7 +65,7 @@ def grid_window(alignment: Alignment, area: Window) -> Window:
 
 def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
     """Average a plane (h, w) over ``area`` to the LRHS's resolution, over :func:`grid_window`."""
-    whole = _whole_pixels(alignment, area)
+    whole = in_hrls_pixels(grid_window(alignment, area), alignment.scale)
     if whole != area:
         plane = mirrored(plane, area, whole)
     return box_downsample(plane, alignment.scale)
@@ -73,10 +73,5 @@ def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
 
 def from_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
     """Interpolate a plane over :func:`grid_window` of ``area`` at full resolution, (h, w) over ``area``."""
-    whole = _whole_pixels(alignment, area)
+    whole = in_hrls_pixels(grid_window(alignment, area), alignment.scale)
     return upsample_linear(plane, alignment.scale)[area.slices(whole)]
-
-
-def _whole_pixels(alignment: Alignment, area: Window) -> Window:
-    grid, scale = grid_window(alignment, area), alignment.scale
-    return Window(grid.x0 * scale, grid.y0 * scale, grid.x1 * scale, grid.y1 * scale)

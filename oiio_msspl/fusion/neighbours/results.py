@@ -47,8 +47,11 @@ class ResultBand:
         for name, image in target.items():
             image[:] = self._own[name][self._rows]
         self._sum = WeightedSum(target)
-        #: How much neighbours may count: not at all where none counts in the average of renders.
-        self._company = None if frame.frames is None else _company(frame.frames[area.slices(self._window)][..., 0])
+        #: How much neighbours may count, 0 to 1: not at all where none counts in the average of renders.
+        self._company: Array | None = None
+        if frame.frames is not None:
+            counts = frame.frames[area.slices(self._window)][..., 0]
+            self._company = np.clip((counts - 1) / np.float32(COMPANY - 1), 0, 1)
         #: Where the frame may show two surfaces, by the motion to the nearest neighbour on a side.
         self._borders: Mask
 
@@ -76,11 +79,6 @@ class ResultBand:
     def finish(self) -> Array:
         """Turn the sums into means, and return the number of frames."""
         return self._sum.divide()
-
-
-def _company(frames: Array) -> Array:
-    """Return how much neighbours may count (h, w), from 0 to 1, by the number of frames that renders average."""
-    return np.clip((frames - 1) / np.float32(COMPANY - 1), 0, 1)
 
 
 def _borders(motion: Motion, window: Window, area: Window, nearest: NDArray[np.intp] | None = None) -> Mask:

@@ -22,8 +22,10 @@ class WeightedSum:
     def __init__(self, images: dict[str, Array]) -> None:
         # NumPy takes longer for a part of an image in a temporary file than for one of any other.
         self._images = {name: np.asarray(image) for name, image in images.items()}
-        self._weights: Array = np.ones(next(iter(images.values())).shape[:2], np.float32)
+        height, width = next(iter(images.values())).shape[:2]
+        self._weights: Array = np.ones((height, width), np.float32)
         self._squares = np.ones_like(self._weights)
+        self._row_size = width * sum(image.shape[-1] for image in images.values())
 
     def add(self, feature: Callable[[str, slice], Array], weight: Array) -> None:
         """Add features with a weight (h, w).
@@ -41,7 +43,7 @@ class WeightedSum:
                 for name, image in self._images.items():
                     image[rows] += _of(name, part, squares) * feature(name, rows)
 
-        self._for_blocks(work)
+        for_row_blocks(work, len(self._weights), self._row_size)
 
     def divide(self) -> Array:
         """Turn the sums into means.
@@ -57,12 +59,8 @@ class WeightedSum:
                 for name, image in self._images.items():
                     image[rows] /= _of(name, weights, squares)
 
-        self._for_blocks(work)
+        for_row_blocks(work, len(self._weights), self._row_size)
         return np.divide(np.square(self._weights), self._squares, dtype=np.float32)[..., None]
-
-    def _for_blocks(self, work: Callable[[slice], None]) -> None:
-        width = sum(image.shape[-1] for image in self._images.values())
-        for_row_blocks(work, len(self._weights), self._weights.shape[1] * width)
 
 
 def _of(feature: str, weights: Array, squares: Array) -> Array:

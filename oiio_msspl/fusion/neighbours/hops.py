@@ -47,22 +47,19 @@ def find_hops(
         try:
             neighbour, neighbour_picture = frame_of(other)
             _check_alike(own, picture, neighbour, neighbour_picture)
-            lacking: list[str] = []
+            there, back = motion.between(nearer, neighbour)
             if isinstance(picture, RenderPair) and isinstance(neighbour_picture, RenderPair):
                 if nearer is own and shared_noise(picture, neighbour_picture) > SAME_NOISE:
                     text = f"frames {min(number, other)} and {max(number, other)} {SAME_SEED}"
                     warnings.append(Finding("same_seed", text))
-                lacking = lacking_passes(picture, neighbour_picture)
-            there, back = motion.between(nearer, neighbour)
+                if lacking := " and ".join(lacking_passes(picture, neighbour_picture)):
+                    text = f"frame {other} has no set of passes with {lacking}, so passes are not averaged"
+                    warnings.append(Finding("passes", text))
         except InputError as error:
             warnings.append(Finding("missing_neighbour", f"frame {other} is not averaged: {error}"))
             break
         hops.append(Hop(neighbour_picture, there, back))
         nearer = neighbour
-        if lacking:
-            names = " and ".join(lacking)
-            text = f"frame {other} has no set of passes with {names}, so passes are not averaged"
-            warnings.append(Finding("passes", text))
     return hops
 
 

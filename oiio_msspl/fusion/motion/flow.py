@@ -15,7 +15,6 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.colour import luminance
-from oiio_msspl.image.sampling import nearest_indices
 
 #: A vector is believed if the way there and back ends this close to its pixel, in pixels.
 FLOW_ERROR = 0.75
@@ -53,11 +52,9 @@ def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: W
     y, x = np.mgrid[0 : window.height, 0 : window.width].astype(np.float32)
     at_x, at_y = x + there[..., 0], y + there[..., 1]
     trip = there + sample_linear(back, at_x, at_y)
-    rendered = np.zeros(frame.shape[:2], np.bool_)
-    rendered[shared.slices(window)] = True
-    inside = (at_x >= 0) & (at_y >= 0) & (at_x <= window.width - 1) & (at_y <= window.height - 1)
+    rows, columns = shared.slices(window)
+    inside = (at_x >= columns.start) & (at_x <= columns.stop - 1) & (at_y >= rows.start) & (at_y <= rows.stop - 1)
     known = inside & (np.hypot(trip[..., 0], trip[..., 1]) < FLOW_ERROR)
-    known &= rendered.take(nearest_indices(at_x, at_y, (window.height, window.width)))
     there[~known] = 0
     return there, known
 

@@ -84,9 +84,8 @@ def luminance(rgb: Array) -> Array:
 def srgb(linear: Array) -> Array:
     """Convert scene-linear values to sRGB, clipped to [0, 1]: the display transform s(x) of the paper, section 5.1."""
     x = np.clip(linear, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-12), 1 / 2.4) - 0.055).astype(
-        np.float32
-    )
+    curve = 1.055 * np.power(np.maximum(x, 1e-12), 1 / 2.4) - 0.055
+    return np.where(x <= 0.0031308, 12.92 * x, curve).astype(np.float32)
 
 
 def converted(rgb: Array, source: ColourSpace, target: ColourSpace) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.neighbours.bands import for_bands, to_grid
+from oiio_msspl.fusion.neighbours.bands import whole_grid
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
 from oiio_msspl.fusion.tiles.prepare import FramePair
@@ -49,9 +49,7 @@ def fuse_alone(
     if counts is None:
         return
     window, seconds = alignment.hr_data_window, session.seconds
-    alone = np.concatenate(
-        for_bands(alignment, lambda core, _: to_grid(alignment, _alone(counts[core.slices(window)]), core))
-    )[..., 0]
+    alone = whole_grid(alignment, lambda core: _alone(counts[core.slices(window)]))[..., 0]
     reach = max(1, SMALLEST // 2 // alignment.scale)
     places = grown(all_within(alone >= 0.5, reach), reach)
     if not places.any() or alone.min() == 1:  # a frame that stands alone was fused from its own renders

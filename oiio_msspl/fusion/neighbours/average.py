@@ -17,7 +17,7 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.vectors import sample_linear
-from oiio_msspl.fusion.neighbours.bands import for_bands, rows_in_bands, to_grid
+from oiio_msspl.fusion.neighbours.bands import for_bands, rows_in_bands, whole_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
 from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS, Features, RenderBand, RenderPair, read
 from oiio_msspl.fusion.neighbours.results import Images, ResultBand, images_of
@@ -119,8 +119,7 @@ def _cells(frame: FusedFrame) -> list[Array]:
 
 def _picture(frame: FusedFrame) -> Array:
     """Return the colours of a fused frame (h, w, 3) over the grid."""
-    bands = for_bands(frame.alignment, lambda core, _: to_grid(frame.alignment, images_of(frame, core)[RGB], core))
-    return np.concatenate(bands)
+    return whole_grid(frame.alignment, lambda core: images_of(frame, core)[RGB])
 
 
 def _average(

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
+import numpy as np
+
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import in_hrls_pixels, mirrored
@@ -45,9 +47,7 @@ def for_bands(alignment: Alignment, work: Callable[[Window, Window], T], weight:
 
 def _band_rows(window: Window, weight: float) -> int:
     pairs = -(-window.width * window.height // BAND_PIXELS)
-    rows = -(-window.height // max(2 * pairs, 1))
-    if weight > 1:
-        rows = int((rows + 2 * REACH) / weight) - 2 * REACH
+    rows = int((-(-window.height // max(2 * pairs, 1)) + 2 * REACH) / weight) - 2 * REACH
     return -(-max(rows, BAND_ROWS) // ROW_MULTIPLE) * ROW_MULTIPLE
 
 
@@ -69,6 +69,11 @@ def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
     if whole != area:
         plane = mirrored(plane, area, whole)
     return box_downsample(plane, alignment.scale)
+
+
+def whole_grid(alignment: Alignment, pixels: Callable[[Window], Array]) -> Array:
+    """Average a frame to the LRHS's resolution, over the grid. ``pixels`` returns those of an area, (h, w, ...)."""
+    return np.concatenate(for_bands(alignment, lambda core, _: to_grid(alignment, pixels(core), core)))
 
 
 def from_grid(alignment: Alignment, plane: Array, area: Window) -> Array:

@@ -18,7 +18,7 @@ from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.checks.averages import BRIGHTEST
 from oiio_msspl.fusion.checks.noise_level import has_clean_aovs
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
-from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
+from oiio_msspl.fusion.neighbours.bands import from_grid, grid_window, to_grid, whole_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
 from oiio_msspl.fusion.neighbours.trust import WHOLE, Judge, Light, cells, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
@@ -77,15 +77,10 @@ class RenderPair:
         Both show the same places: where an odd size was rounded, the LRHS is interpolated. Of one render, both are
         its :meth:`halves`. All are finite and >= 0.
         """
-        alignment = self.alignment
-
-        def band(core: Window, _: Window) -> Array:
-            return to_grid(alignment, _bounded(repair(read(self.hr, core, [RGB])[RGB])[0]), core)
-
-        high = np.concatenate(for_bands(alignment, band))
+        high = whole_grid(self.alignment, lambda area: _bounded(repair(read(self.hr, area, [RGB])[RGB])[0]))
         if self.is_one_render:
             return self.halves(high)
-        lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], exact=True)[RGB]
+        lrhs = read_lrhs(self.lr, self.alignment, self.alignment.grid, [RGB], exact=True)[RGB]
         return _bounded(lrhs), high
 
     @cached_property

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layer_by_channel, matches_layer
-from oiio_msspl.exr.reader import Channel, ExrFile, Part
-from oiio_msspl.exr.replaced import DTYPES, ReplacedChannels
+from oiio_msspl.exr.reader import DTYPES, Channel, ExrFile, Part
+from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import DEFAULT_COMPRESSION, LOSSLESS, WriteOptions
 from oiio_msspl.image.arrays import HALF_MAX, Array
 
@@ -41,7 +41,7 @@ class FileContents:
     attributes: dict[str, str]
     """Header attributes that are added to the part of the beauty."""
     options: WriteOptions
-    replaced: ReplacedChannels | None = None
+    replaced: ReplacedChannels = field(default_factory=ReplacedChannels)
     """New pixels for channels that are passed on, over the data window of their part."""
 
     @property
@@ -80,6 +80,18 @@ class FileContents:
     def extra_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
         """Return rows of a further layer as stored, (stop - start, width, channels)."""
         return self._stored(self.extra[name][start:stop])
+
+    @cached_property
+    def passed_on(self) -> list[tuple[Part, list[Channel]]]:
+        """The parts of the HRLS with their channels that are neither fused nor dropped."""
+        left_out = self.dropped.union(self.beauty)
+        parts = ((part, [c for c in part.channels if c not in left_out]) for part in self.source.parts if not part.deep)
+        return [(part, channels) for part, channels in parts if channels]
+
+    def planes(self, part: Part, channels: Sequence[Channel], *, on_disk: bool) -> dict[Channel, NDArray[Any]]:
+        """Return channels that are passed on, with new pixels if they are replaced, as stored, (height, width) each."""
+        new = {channel: self.replaced.planes[channel] for channel in channels if channel in self.replaced.planes}
+        return new | self.source.native_planes(part, [c for c in channels if c not in new], on_disk=on_disk)
 
     def _stored(self, values: NDArray[Any]) -> NDArray[Any]:
         if self.kind == "half":

@@ -6,10 +6,8 @@ A description starts as a copy of the HRLS's part, so that windows and metadata 
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 import OpenImageIO as oiio
@@ -32,17 +30,8 @@ _KEPT_IN_EVERY_PART = (
     *("screenWindowWidth", "screenWindowCenter", "DateTime"),
     *(*_SHARED, "colorInteropID", "view", "name", "oiio:subimagename", "compression"),
 )
-
-#: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.
-LARGEST_MIXED_PART = 256 << 20
-
-
-class _NameOrigin(IntEnum):
-    """The source of a part's name. Of two equal names, the one from the source listed first stays as it is."""
-
-    PART = 0
-    LAYER = 1
-    MADE_UP = 2
+#: Where a part's name comes from. Of two equal names, the one from the source listed first stays as it is.
+_PART, _LAYER, _MADE_UP = range(3)
 
 
 @dataclass(frozen=True)
@@ -51,9 +40,8 @@ class PassedOnPart:
 
     spec: Any
     source: Part
-    runs: tuple[tuple[Channel, ...], ...] | None
-    """Runs of neighbouring channels of one pixel type, in the order in which they are written. None copies the whole
-    part with its mixed pixel types."""
+    channels: Sequence[Channel]
+    """All have one pixel type."""
 
 
 def beauty_spec(contents: FileContents) -> Any:
@@ -82,74 +70,48 @@ def extra_spec(contents: FileContents, name: str, taken: set[str]) -> Any:
     return spec
 
 
-def passed_on_parts(contents: FileContents, taken: set[str]) -> Iterator[PassedOnPart]:
-    """Yield parts with all channels of the HRLS that are neither fused nor dropped, and add their names to ``taken``.
+def passed_on_parts(contents: FileContents, taken: set[str]) -> list[PassedOnPart]:
+    """Return parts with all channels of the HRLS that are neither fused nor dropped, and add their names to ``taken``.
 
     A part stays whole if it can. Others are split into one part for each layer and pixel type.
     """
     named = list(_named_parts(contents))
-    for name, origin, part in named:
-        reserved = {n for n, o, _ in named if o < origin or (o == origin and n != name)}
-        _set_name(part.spec, _unique(name, taken, reserved))
-        yield part
+    for name, _, part in sorted(named, key=lambda each: each[1]):
+        _set_name(part.spec, _unique(name, taken))
+    return [part for _, _, part in named]
 
 
-def _named_parts(contents: FileContents) -> Iterator[tuple[str, _NameOrigin, PassedOnPart]]:
-    """Yield the parts that are passed on, with the names that they should have."""
-    layer_of = contents.layers
-    for part in contents.source.parts:
-        if part.deep:
-            continue
-        if _stays_whole(part, contents):
-            origin = _NameOrigin.PART if part.name else _NameOrigin.MADE_UP
-            spec = _copied(part)
-            spec.channelnames = tuple(channel.name for channel in part.channels)
-            whole = PassedOnPart(spec, part, (part.channels,) if _has_one_type(part) else None)
-            yield part.name or f"part{part.index}", origin, whole
+def _named_parts(contents: FileContents) -> Iterator[tuple[str, int, PassedOnPart]]:
+    """Yield the parts that are passed on, with the names that they should have and where these come from."""
+    is_nuke = contents.options.layout == "nuke"
+    for part, passed_on in contents.passed_on:
+        kinds = {channel.type for channel in passed_on}
+        if not is_nuke and len(passed_on) == len(part.channels) and len(kinds) == 1:
+            name, origin = (part.name, _PART) if part.name else (f"part{part.index}", _MADE_UP)
+            spec = _spec(part, name, [channel.name for channel in passed_on], kinds.pop(), "")
+            yield name, origin, PassedOnPart(spec, part, passed_on)
             continue
         groups: dict[tuple[str, str, str], list[Channel]] = {}
-        for channel in part.channels:
-            if channel not in contents.beauty and channel not in contents.dropped:
-                layer = layer_of.get(channel)
-                # A channel without a layer repeats another one (foo.r beside foo.R): it gets a part of its own.
-                key = (layer.view, layer.name, channel.type) if layer else ("", channel.name, channel.type)
-                groups.setdefault(key, []).append(channel)
+        for channel in passed_on:
+            layer = contents.layers.get(channel)
+            # A channel without a layer repeats another one (foo.r beside foo.R): it gets a part of its own.
+            key = (layer.view, layer.name, channel.type) if layer else ("", channel.name, channel.type)
+            groups.setdefault(key, []).append(channel)
         # Metadata is written once: in the beauty's part, or in the first part that this one is split into.
         repeats_metadata = not set(contents.beauty).isdisjoint(part.channels)
         for (view, layer_name, kind), channels in groups.items():
             name, origin = _layer_name(contents, part, view, layer_name, channels)
-            names = _components(channels) if contents.options.layout == "nuke" else [c.name for c in channels]
+            names = _components(channels) if is_nuke else [c.name for c in channels]
             spec = _spec(part, name, names, kind, view)
             if repeats_metadata:
                 _drop_repeated_attributes(spec)
-            yield name, origin, PassedOnPart(spec, part, tuple(runs(channels)))
+            yield name, origin, PassedOnPart(spec, part, channels)
             repeats_metadata = True
-
-
-def _stays_whole(part: Part, contents: FileContents) -> bool:
-    """Return whether all channels of a part can be copied into one part of the same name."""
-    if contents.options.layout == "nuke" or any(c in contents.beauty or c in contents.dropped for c in part.channels):
-        return False
-    if _has_one_type(part):
-        return True
-    # OpenEXR can't mix tiles with scan lines in one file, and the beauty has scan lines. OpenImageIO can't rewrite
-    # mixed pixel types as scan lines: it copies such a part in memory, as it is.
-    is_replaced = contents.replaced is not None and any(c in contents.replaced for c in part.channels)
-    return not is_replaced and part.tile == (0, 0) and part.nbytes <= LARGEST_MIXED_PART
-
-
-def is_held_whole(part: Part, contents: FileContents) -> bool:
-    """Return whether a part is held in memory while it is copied: it stays whole and has several pixel types."""
-    return not part.deep and not _has_one_type(part) and _stays_whole(part, contents)
-
-
-def _has_one_type(part: Part) -> bool:
-    return len({channel.type for channel in part.channels}) == 1
 
 
 def _layer_name(
     contents: FileContents, part: Part, view: str, layer: str, channels: Sequence[Channel]
-) -> tuple[str, _NameOrigin]:
+) -> tuple[str, int]:
     """Name the part for the channels of one layer and pixel type."""
     components = _components(channels)
     is_beauty = not layer and view and {"R", "G", "B"} <= {*components}  # of another view
@@ -162,7 +124,7 @@ def _layer_name(
     else:
         name = f"{plain}.{view}" if view and view != contents.view else plain
         is_parts = name == part.name
-    return name, _NameOrigin.PART if is_parts else _NameOrigin.LAYER if layer else _NameOrigin.MADE_UP
+    return name, _PART if is_parts else _LAYER if layer else _MADE_UP
 
 
 def _components(channels: Sequence[Channel]) -> list[str]:
@@ -182,37 +144,37 @@ def share_attributes(specs: Sequence[Any], source: ExrFile) -> None:
                 spec.attribute(name, attributes[0].type, attributes[0].value)
 
 
-def runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
-    """Cut channels of one pixel type where their indices are not neighbours: a run can be decoded in one call."""
-    # In a run, index and position grow together.
-    for _, run in itertools.groupby(enumerate(channels), lambda place: place[1].index - place[0]):
-        yield tuple(channel for _, channel in run)
-
-
 def _nuke_name(layer: str, view: str) -> str:
     """Name a part as Nuke does: the only dot is the one before the view."""
     return layer.replace(".", "_") + (f".{view}" if view else "")
 
 
-def _unique(name: str, taken: set[str], reserved: Collection[str] = ()) -> str:
-    """Add a number to a part's name if it is taken or reserved: parts of one file need different names."""
+def _unique(name: str, taken: set[str]) -> str:
+    """Add a number to a part's name if it is taken: parts of one file need different names."""
     candidate, number = name, 2
-    while candidate in taken or candidate in reserved:
+    while candidate in taken:
         candidate, number = f"{name}{number}", number + 1
     taken.add(candidate)
     return candidate
 
 
 def _spec(part: Part, name: str, channels: list[str], kind: str, view: str) -> Any:
-    """Describe a part of scan lines with channels of one view, with the windows and metadata of ``part``."""
-    spec = _copied(part)
+    """Describe a part of scan lines with channels of one pixel type, with the windows and metadata of ``part``.
+
+    ``view`` is that of all channels; empty if the file has no views, or if the part keeps all its channels.
+    """
+    spec = oiio.ImageSpec(part.spec)
+    spec.tile_width = spec.tile_height = spec.tile_depth = 0
+    for attribute in _STRUCTURE:
+        spec.erase_attribute(attribute)
+    _compress(spec, lossless(part))
     spec.nchannels = len(channels)
     spec.channelnames = tuple(channels)
     spec.channelformats = ()
     spec.format = oiio.TypeDesc(kind)
     _set_name(spec, name)
-    spec.erase_attribute("multiView")  # it names the views of a part that has several
     if view:
+        spec.erase_attribute("multiView")  # it names the views of a part that has several
         spec.attribute("view", view)
     return spec
 
@@ -223,16 +185,6 @@ def _drop_repeated_attributes(spec: Any) -> None:
         # OpenImageIO can't erase an attribute whose name is not UTF-8. Such a name holds surrogates.
         if name not in _KEPT_IN_EVERY_PART and name.isprintable():
             spec.erase_attribute(name)
-
-
-def _copied(part: Part) -> Any:
-    """Describe a part of scan lines with all channels, windows and metadata of ``part``."""
-    spec = oiio.ImageSpec(part.spec)
-    spec.tile_width = spec.tile_height = spec.tile_depth = 0
-    for attribute in _STRUCTURE:
-        spec.erase_attribute(attribute)
-    _compress(spec, lossless(part))
-    return spec
 
 
 def _set_name(spec: Any, name: str) -> None:

@@ -22,7 +22,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_encodable
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import LARGEST_STRIP, ROWS_PER_STRIP, StripCache, StripKey, strip_rows
-from oiio_msspl.image.arrays import Array, unload
+from oiio_msspl.image.arrays import Array, blank, unload
 
 # OpenImageIO's own limits protect programs that read whole files: 1024 channels, and an image as large as the memory.
 # Files with thousands of light groups are larger. This module reads by rectangle, so the image needs no limit.
@@ -35,6 +35,9 @@ ROWS_PER_CHUNK = {
     **dict.fromkeys(("piz", "b44", "b44a", "dwaa", "htj2k32"), 32),
     **dict.fromkeys(("dwab", "htj2k256"), 256),
 }
+
+#: NumPy's type of each pixel type.
+DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.uint32}
 
 #: Characters of OpenImageIO's error messages that are quoted. A damaged header may be quoted in one.
 LONGEST_REASON = 200
@@ -167,38 +170,28 @@ class ExrFile:
             self._cache.max_bytes = 0
             self._cache.clear()
 
-    def native_strips(
-        self, part: Part, first: int, last: int, later: Sequence[tuple[int, int]] = ()
-    ) -> Iterator[tuple[int, int, NDArray[Any]]]:
-        """Yield all rows of neighbouring channels in their stored pixel type, to be copied bit for bit.
+    def native_planes(self, part: Part, channels: Sequence[Channel], *, on_disk: bool) -> dict[Channel, NDArray[Any]]:
+        """Return whole channels of a part in their stored pixel types, (height, width) each, to be copied bit for bit.
 
         Args:
-            first, last: indices of the first channel and of the one after the last. All have one pixel type.
-            later: more such ranges, which later calls read inside of one :meth:`cache_strips`. Those of this pixel type
-                are decoded together with this range and kept until they are read; those that do not fit into the
-                cache, in a temporary file.
-
-        Yields:
-            First row, last row (exclusive), and the strip (rows, width, channels).
+            on_disk: put them into temporary files.
 
         Raises:
             InputError: pixels can't be decoded.
-            MssplError: the disk has no room for the temporary file.
+            MssplError: the disk has no room for the temporary files.
         """
-        window, kind = part.data_window, part.channels[first].type
-        later = [(a, b) for a, b in later if part.channels[a].type == kind]
-        start, stop = min(a for a, _ in [(first, last), *later]), max(b for _, b in [(first, last), *later])
-        for y0, y1 in strip_rows(window.y0, window.y1, window.y0, part.strip_height, window.y1):
-            strip = self._cache.pop(StripKey(self.path, part.index, tuple(range(first, last)), y0, y1))
-            if strip is None:
-                decoded = self._decode(part, y0, y1, start, stop, kind)
-                strip = decoded[..., first - start : last - start]
-                self._cache.keep_all({
-                    StripKey(self.path, part.index, tuple(range(a, b)), y0, y1): decoded[..., a - start : b - start]
-                    for a, b in later
-                })  # fmt: skip
-            yield y0, y1, strip
-            unload(strip)
+        window, planes = part.data_window, dict[Channel, NDArray[Any]]()
+        for kind, dtype in DTYPES.items():
+            alike = [channel for channel in channels if channel.type == kind]
+            if not alike:
+                continue
+            pixels = blank((window.height, window.width, len(alike)), dtype, on_disk=on_disk)
+            for y0, y1 in strip_rows(window.y0, window.y1, window.y0, part.strip_height, window.y1):
+                strip = self._decode_channels(part, y0, y1, tuple(channel.index for channel in alike), kind)
+                pixels[y0 - window.y0 : y1 - window.y0] = strip
+                unload(pixels)
+            planes |= zip(alike, np.moveaxis(pixels, -1, 0), strict=True)
+        return planes
 
     def _read_part(self, part: Part, columns: dict[int, int], window: Window, result: Array, cache: StripCache) -> None:
         """Read channels of a part, whose indices are ``columns`` by position in ``result``, which covers ``window``."""
@@ -214,18 +207,17 @@ class ExrFile:
             key = StripKey(self.path, part.index, indices, y0, y1)
             strip = cache.get(key)
             if strip is None:
-                strip = self._decode_channels(part, y0, y1, indices)
+                kind = "half" if all(part.channels[i].type == "half" for i in indices) else "float"
+                strip = self._decode_channels(part, y0, y1, indices, kind)
                 cache.keep(key, strip)
             shared = area.intersect(Window(area.x0, y0, area.x1, y1))
             result[(*shared.slices(window), planes)] = strip[shared.slices(Window(whole.x0, y0, whole.x1, y1))]
 
-    def _decode_channels(self, part: Part, y0: int, y1: int, indices: tuple[int, ...]) -> NDArray[Any]:
-        """Decode a strip of some channels, each contiguous: half if all are stored as half, otherwise float."""
+    def _decode_channels(self, part: Part, y0: int, y1: int, indices: tuple[int, ...], kind: str) -> NDArray[Any]:
+        """Decode a strip of some channels in one pixel type, (rows, width, channels), each contiguous."""
         first, last = min(indices), max(indices) + 1
-        decoded = part.channels[first:last]
-        strip = self._decode(part, y0, y1, first, last, "half" if all(c.type == "half" for c in decoded) else "float")
-        dtype = np.float16 if all(part.channels[i].type == "half" for i in indices) else np.float32
-        planes = np.empty((len(indices), *strip.shape[:2]), dtype)
+        strip = self._decode(part, y0, y1, first, last, kind)
+        planes = np.empty((len(indices), *strip.shape[:2]), DTYPES[kind])
         wanted = adjacent([i - first for i in indices])
         for row, pixels in enumerate(strip):  # a row fits into the processor's cache, which makes this twice as fast
             planes[:, row] = pixels.T[wanted]

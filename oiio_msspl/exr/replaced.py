@@ -9,11 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.reader import DTYPES, Channel
 from oiio_msspl.image.arrays import FLOAT_MAX, HALF_MAX, Array, blank, unload
-
-#: NumPy's type of each pixel type.
-DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.uint32}
 
 
 class ReplacedChannels:
@@ -24,7 +21,8 @@ class ReplacedChannels:
     """
 
     def __init__(self) -> None:
-        self._planes: dict[Channel, NDArray[Any]] = {}
+        self.planes: dict[Channel, NDArray[Any]] = {}
+        """(height, width) each."""
 
     def add(self, channels: Sequence[Channel], width: int, height: int) -> None:
         """Make room for channels of ``width`` x ``height`` pixels; a channel that has room keeps it.
@@ -33,13 +31,10 @@ class ReplacedChannels:
             MssplError: the disk has no room.
         """
         for kind, dtype in DTYPES.items():  # one file for all channels of a type
-            new = [channel for channel in dict.fromkeys(channels) if channel not in self and channel.type == kind]
+            new = [c for c in dict.fromkeys(channels) if c not in self.planes and c.type == kind]
             if new:
                 planes = np.moveaxis(blank((height, width, len(new)), dtype, on_disk=True), -1, 0)
-                self._planes |= zip(new, planes, strict=True)
-
-    def __contains__(self, channel: Channel) -> bool:
-        return channel in self._planes
+                self.planes |= zip(new, planes, strict=True)
 
     def put(self, channel: Channel, start: int, rows: Array) -> int:
         """Store rows (n, width) of a channel from row ``start`` on; values too bright for its type are clipped.
@@ -48,22 +43,7 @@ class ReplacedChannels:
             The number of values that were too bright.
         """
         largest = HALF_MAX if channel.type == "half" else FLOAT_MAX
-        plane = self._planes[channel]
+        plane = self.planes[channel]
         plane[start : start + len(rows)] = np.clip(rows, -largest, largest)
         unload(plane)
         return int(np.count_nonzero(rows > largest)) if rows.size and rows.max() > largest else 0
-
-    def get(self, channel: Channel, start: int, stop: int) -> NDArray[Any]:
-        """Return rows of a channel, (stop - start, width)."""
-        return self._planes[channel][start:stop]
-
-    def apply(self, channels: Sequence[Channel], start: int, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Return a copy of rows (n, width, channels) from row ``start`` on, with the new pixels in it."""
-        if not any(channel in self for channel in channels):
-            return pixels
-        pixels = pixels.copy()
-        for i, channel in enumerate(channels):
-            if channel in self:
-                pixels[..., i] = self.get(channel, start, start + len(pixels))
-                unload(self._planes[channel])
-        return pixels

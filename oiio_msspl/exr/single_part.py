@@ -7,19 +7,15 @@ the whole file in memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import not_written
 from oiio_msspl.exr.contents import FileContents
-from oiio_msspl.exr.part_specs import runs
-from oiio_msspl.exr.reader import Channel, Part
-from oiio_msspl.exr.replaced import DTYPES
+from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.write_options import COMPONENTS
 from oiio_msspl.image.arrays import planes_of
 
@@ -55,25 +51,8 @@ def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
 def _passed_on_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
     """Return the channels of the HRLS that are neither fused nor dropped, (height, width) by name."""
     names = channel_names(contents)
-    channels: dict[str, NDArray[Any]] = {}
-    for part, passed_on in _passed_on(contents):
-        window = part.data_window
-        for kind in sorted({channel.type for channel in passed_on}):
-            for run in runs([channel for channel in passed_on if channel.type == kind]):
-                planes = np.empty((len(run), window.height, window.width), DTYPES[kind])
-                channels |= zip([names[channel] for channel in run], planes, strict=True)
-                for y0, y1, strip in contents.source.native_strips(part, run[0].index, run[-1].index + 1):
-                    if contents.replaced is not None:
-                        strip = contents.replaced.apply(run, y0 - window.y0, strip)
-                    planes[:, y0 - window.y0 : y1 - window.y0] = np.moveaxis(strip, -1, 0)
-    return channels
-
-
-def _passed_on(contents: FileContents) -> Iterator[tuple[Part, list[Channel]]]:
-    """Yield the parts of the HRLS with their channels that are neither fused nor dropped."""
-    for part in contents.source.parts:
-        if not part.deep and not contents.dropped.issuperset(part.channels):
-            yield part, [c for c in part.channels if c not in contents.beauty and c not in contents.dropped]
+    planes = (contents.planes(part, channels, on_disk=False) for part, channels in contents.passed_on)
+    return {names[channel]: plane for part in planes for channel, plane in part.items()}
 
 
 def channel_names(contents: FileContents) -> dict[Channel, str]:
@@ -81,7 +60,7 @@ def channel_names(contents: FileContents) -> dict[Channel, str]:
     path, window = contents.source.path, contents.home.data_window
     taken = {channel.name for channel in contents.beauty}
     names: dict[Channel, str] = {}
-    for part, passed_on in _passed_on(contents):
+    for part, passed_on in contents.passed_on:
         if part.data_window != window:
             raise InputError(
                 f"--layout multilayer: part '{part.name}' of {path} has the data window {part.data_window}, "
@@ -115,7 +94,7 @@ def _header(contents: FileContents) -> dict[str, Any]:
         # OpenEXR 3.3 returns no parts without their pixels.
         with OpenEXR.File(str(path), header_only=not OpenEXR.__version__.startswith("3.3.")) as source:
             header = dict(source.parts[contents.home.index].header)
-            for part, _ in _passed_on(contents):  # such as Cryptomatte's manifests
+            for part, _ in contents.passed_on:  # such as Cryptomatte's manifests
                 passed_on = source.parts[part.index].header
                 header = {key: value for key, value in passed_on.items() if key != "view"} | header
             for part in source.parts:  # also those that are left out
@@ -127,7 +106,7 @@ def _header(contents: FileContents) -> dict[str, Any]:
     for key in _STRUCTURE:
         header.pop(key, None)
     layers = contents.layers
-    channels = (channel for _, passed_on in _passed_on(contents) for channel in passed_on)
+    channels = (channel for _, passed_on in contents.passed_on for channel in passed_on)
     views = dict.fromkeys([contents.view, *(layers[channel].view for channel in channels if channel in layers)])
     views.pop("", None)
     if len(views) > 1 or "multiView" in header:

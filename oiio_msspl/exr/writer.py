@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the result: the fused beauty first, then the layers of the HRLS that are passed on, bit for bit.
 
-These layers keep their pixel types: OpenImageIO copies whole parts, and the channels of split parts are copied strip by
-strip in their stored type.
+These layers keep their pixel types.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
@@ -22,21 +22,19 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import not_written, replacing
 from oiio_msspl.exr.contents import FileContents, dropped_channels, without_alpha_apart
 from oiio_msspl.exr.part_specs import (
-    PassedOnPart,
     beauty_spec,
     extra_spec,
-    is_held_whole,
     passed_on_parts,
     share_attributes,
 )
-from oiio_msspl.exr.reader import Channel, ExrFile, open_exr, reason_of, unreadable
+from oiio_msspl.exr.reader import Channel, ExrFile, open_exr, reason_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import channel_names, write_single_part
-from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
+from oiio_msspl.exr.strips import LARGEST_STRIP, ROWS_PER_STRIP, strip_rows
 from oiio_msspl.exr.write_options import ADDED, WriteOptions
 from oiio_msspl.findings import Finding
-from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.arrays import Array, unload
 from oiio_msspl.image.parallel import one_ahead
 
 
@@ -52,7 +50,6 @@ def write_fused(
     extra: Mapping[str, NDArray[Any]] = MappingProxyType({}),
     replaced: ReplacedChannels | None = None,
     overwrite: bool = False,
-    cache_bytes: int = 0,
     before_rename: Callable[[], object] | None = None,
 ) -> list[Finding]:
     """Write the fused frame to ``path``, atomically.
@@ -64,8 +61,6 @@ def write_fused(
         alpha: (height, width, 1) if ``beauty`` has an A, otherwise None.
         attributes, replaced: see :class:`FileContents`.
         extra: further layers, such as ``error``, see :attr:`FileContents.extra`.
-        cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit waits in temporary
-            files.
         overwrite, before_rename: see :func:`oiio_msspl.exr.atomic.replacing`.
 
     Returns:
@@ -81,10 +76,9 @@ def write_fused(
         for part in source.parts
         if part.deep
     ]
-    colour = without_alpha_apart(beauty)
+    colour, replaced = without_alpha_apart(beauty), replaced or ReplacedChannels()
     if len(colour) < len(beauty) and alpha is not None:
         if source.parts[beauty[-1].part].data_window == source.parts[beauty[0].part].data_window:
-            replaced = replaced or ReplacedChannels()
             replaced.add(beauty[-1:], alpha.shape[1], alpha.shape[0])
             replaced.put(beauty[-1], 0, alpha[..., 0])
         else:
@@ -96,7 +90,7 @@ def write_fused(
         if options.layout == "multilayer":
             write_single_part(temporary, contents)
         else:
-            _write_parts(temporary, contents, cache_bytes)
+            _write_parts(temporary, contents)
         _check_whole(temporary, path, contents.compression)
     return warnings
 
@@ -116,11 +110,11 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
 
 def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions) -> int:
     """Return the bytes of pixels that :func:`write_fused` holds beside the fused frame, by the headers alone."""
+    if options.layout != "multilayer":
+        return 0
     contents = _without_pixels(source, beauty, options)
-    if options.layout == "multilayer":
-        flat = [part for part in source.parts if not part.deep]
-        return sum(part.plane_bytes(c) for part in flat for c in part.channels if c not in contents.dropped)
-    return max((part.nbytes for part in source.parts if is_held_whole(part, contents)), default=0)
+    passed_on = (part.plane_bytes(channel) for part, channels in contents.passed_on for channel in channels)
+    return sum(passed_on) + sum(contents.home.plane_bytes(channel) for channel in contents.beauty)
 
 
 def _without_pixels(
@@ -132,11 +126,11 @@ def _without_pixels(
     return FileContents(source, without_alpha_apart(beauty), dropped, nothing, None, layers, {}, options)
 
 
-def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
+def _write_parts(path: Path, contents: FileContents) -> None:
     """Write a file of several parts: the beauty, the further layers, and those that are passed on."""
     beauty = beauty_spec(contents)
     taken = {str(beauty.getattribute("oiio:subimagename"))}
-    passed_on = list(passed_on_parts(contents, taken))
+    passed_on = passed_on_parts(contents, taken)
     extra = {name: extra_spec(contents, name, taken) for name in contents.extra}
     specs = [beauty, *extra.values(), *(part.spec for part in passed_on)]
     share_attributes(specs, contents.source)
@@ -149,10 +143,15 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     for name, spec in extra.items():
         ok = ok and writer.open(str(path), spec, "AppendSubimage")
         ok = ok and _write_rows(writer, spec, partial(contents.extra_rows, name))
-    with contents.source.cache_strips(cache_bytes):
-        for position, part in enumerate(passed_on, start=1):
+    for source, group in itertools.groupby(passed_on, key=lambda part: part.source):
+        parts = list(group)
+        planes = contents.planes(
+            source, [channel for part in parts for channel in part.channels], on_disk=source.nbytes > LARGEST_STRIP
+        )
+        for part in parts:
             ok = ok and writer.open(str(path), part.spec, "AppendSubimage")
-            ok = ok and _copy(contents, part, passed_on[position:], writer)
+            rows = partial(_interleaved, [planes[channel] for channel in part.channels])
+            ok = ok and _write_rows(writer, part.spec, rows, source.strip_height)
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
@@ -177,9 +176,11 @@ def _check_whole(temporary: Path, path: Path, compression: str) -> None:
         raise InputError(f"--compression {compression}: this OpenImageIO writes {written} instead; name another one")
 
 
-def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:
+def _write_rows(
+    writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]], strip_height: int = ROWS_PER_STRIP
+) -> bool:
     """Write the part that is open, a strip at a time; ``rows(start, stop)`` gives its pixels."""
-    ranges = strip_rows(0, spec.height, 0, ROWS_PER_STRIP, spec.height)
+    ranges = strip_rows(0, spec.height, 0, strip_height, spec.height)
     # The next rows are converted while OpenImageIO compresses these.
     for start, stop, pixels in one_ahead((a, b, rows(a, b)) for a, b in ranges):
         if not writer.write_scanlines(spec.y + start, spec.y + stop, 0, pixels):
@@ -187,30 +188,9 @@ def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]
     return True
 
 
-def _copy(contents: FileContents, part: PassedOnPart, later: Sequence[PassedOnPart], writer: Any) -> bool:
-    """Copy pixels of the HRLS into the open part in their stored types; ``later`` parts follow."""
-    file, replaced = contents.source, contents.replaced
-    if part.runs is None:
-        source = oiio.ImageInput.open(str(file.path))
-        copied = source is not None and source.seek_subimage(part.source.index, 0) and writer.copy_image(source)
-        if not copied and source is not None and source.has_error:
-            raise unreadable(file.path, part.source, reason_of(source))
-        return bool(copied)
-    ranges = [
-        (run[0].index, run[-1].index + 1)
-        for written in (part, *later)
-        if written.source.index == part.source.index and written.runs
-        for run in written.runs
-    ]
-    runs = [file.native_strips(part.source, *ranges[i], ranges[i + 1 :]) for i in range(len(part.runs))]
-    # The next strips are decoded while OpenImageIO compresses these.
-    for strips in one_ahead(zip(*runs, strict=True)):
-        y0, y1, pixels = strips[0]
-        if len(strips) > 1:
-            pixels = np.concatenate([strip for _, _, strip in strips], axis=-1)
-        if replaced is not None:
-            channels = [channel for run in part.runs for channel in run]
-            pixels = replaced.apply(channels, y0 - part.source.data_window.y0, pixels)
-        if not writer.write_scanlines(y0, y1, 0, np.ascontiguousarray(pixels)):
-            return False
-    return True
+def _interleaved(planes: Sequence[NDArray[Any]], start: int, stop: int) -> NDArray[Any]:
+    """Return rows of some channels, (stop - start, width, channels)."""
+    rows = np.stack([plane[start:stop] for plane in planes], axis=-1)
+    for plane in planes:
+        unload(plane)
+    return rows

@@ -105,10 +105,10 @@ def fuse_files(
     opened = time.perf_counter()
     for settled in run.take(views):
         settled.require()
-    frame.session.release_memory()  # for the writer's cache
+    frame.session.release_memory()  # for writing
     frame.report.seconds |= {"read": opened - start, "fuse": time.perf_counter() - opened}
     with limit_threads(threads):
-        write_settled(frame, run.existing, only_frame=True)
+        write_settled(frame, run.existing)
     if progress is not None:
         progress(WHOLE, WHOLE)
     return frame.report

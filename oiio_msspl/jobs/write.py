@@ -25,7 +25,6 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import write_fused
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY
 from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.image.parallel import in_background
 from oiio_msspl.jobs.existing import ExistingResults
@@ -38,7 +37,7 @@ log = logging.getLogger(__name__)
 ROWS_PER_PUT = 256
 
 
-def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bool = False) -> None:
+def write_settled(frame: ShotFrame, existing: ExistingResults) -> None:
     """Write the EXR and the preview of a frame that is settled.
 
     A new EXR gets its name after its preview, so an EXR that exists is a frame that is complete. An EXR that is
@@ -47,7 +46,6 @@ def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bo
     Args:
         frame: its report gets the time of writing, the number of clipped values, and warnings.
         existing: says what is replaced.
-        only_frame: no other frame needs memory.
 
     Raises:
         InputError: another process has put a file there in the meantime.
@@ -75,9 +73,6 @@ def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bo
             extra=_layers_about(picture, settings.write),
             replaced=picture.replaced,
             overwrite=overwrite,
-            # Half of what is left, because compression and the preview need memory, too. In a shot, the next frame
-            # needs all.
-            cache_bytes=max(0, settings.max_memory - FIXED_MEMORY - picture.nbytes) // 2 if only_frame else 0,
             before_rename=before_rename,
         )
 

@@ -113,8 +113,7 @@ def methods(
         with patch("oiio_msspl.fusion.passes.network.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
             made = fuse_passes(PassInputs(lr, hr, frame, [layers]), session=session)
         assert not made.refused
-        height = hr.data_window.height
-        planes = [[made.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]
+        planes = [[made.pixels.planes[c] for c in layer.channels] for layer in layers.layers]
         return colours * np.moveaxis(np.asarray(planes, np.float32), 1, -1)
 
     yield "HRLS", lambda: noisy

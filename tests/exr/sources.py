@@ -104,7 +104,7 @@ def doubles():
 
 
 def beside():
-    """A part of half, float and uint channels beside that of the beauty, which is copied whole."""
+    """A part of half, float and uint channels beside that of the beauty."""
     rest = {name: plane for name, plane in everything().items() if name not in "RGBA"}
     return [("rgba", rgb(picture(H, W)), (0, 0)), ("rest", rest, (0, 0))]
 

@@ -63,10 +63,9 @@ def test_half_float_and_uint_keep_their_types(tmp_path):
         "Z": "float",
         "id": "uint",
     }
-    index = next(c.index for c in part.channels if c.name == "id")
-    (_, _, rows), *_ = file.native_strips(part, index, index + 1)
-    assert rows.dtype == np.uint32
-    assert (rows == 2**32 - 5).all()
+    (ids,) = file.native_planes(part, [c for c in part.channels if c.name == "id"], on_disk=False).values()
+    assert ids.dtype == np.uint32
+    assert (ids == 2**32 - 5).all()
 
 
 def test_channels_of_several_parts_are_read_together(tmp_path):

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoded rows are shared by neighbouring windows, within a number of bytes."""
 
-import mmap
-
 import numpy as np
 import OpenEXR
 import pytest
 
-from oiio_msspl.exr import reader, strips
+from oiio_msspl.exr import reader
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
@@ -157,7 +155,8 @@ def test_a_strip_holds_whole_chunks(tmp_path, compression, rows):
     assert file.parts[0].strip_height == rows
 
 
-def test_split_parts_are_decoded_once_and_copied_bit_for_bit(tmp_path, decoded):
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_whole_channels_are_decoded_once_and_copied_bit_for_bit(tmp_path, decoded, on_disk):
     """Half, float and uint channels alternate in one part; NaN keep their payload."""
     random = np.random.default_rng(0)
     bits = {name: random.integers(0, 1 << 16, (70, 9), dtype=np.uint16).view(np.float16) for name in ("a.x", "c.x")}
@@ -165,44 +164,10 @@ def test_split_parts_are_decoded_once_and_copied_bit_for_bit(tmp_path, decoded):
     bits |= {"d.x": random.integers(0, 1 << 32, (70, 9), dtype=np.uint32)}
     file = open_exr(write_exr(tmp_path / "mixed.exr", bits))
     (part,) = file.parts
-    ranges = [(channel.index, channel.index + 1) for channel in part.channels]
-    with file.cache_strips(10**6):
-        for i, channel in enumerate(part.channels):
-            rows = np.concatenate([s for _, _, s in file.native_strips(part, *ranges[i], ranges[i + 1 :])])
-            assert same_bits(np.ascontiguousarray(rows[..., 0]), bits[channel.name])
+    for channel, plane in file.native_planes(part, part.channels, on_disk=on_disk).items():
+        assert same_bits(plane, bits[channel.name])
+        assert isinstance(plane, np.memmap) == on_disk
     assert len(decoded) == 2 * 3  # two strips, three pixel types
-
-
-def test_only_what_is_still_to_be_written_is_kept(tmp_path, decoded):
-    """The first layer is not kept, nor what nobody asked for; a layer is forgotten when it is read."""
-    values = picture(HEIGHT, WIDTH).astype(np.float16)
-    file = open_exr(write_exr(tmp_path / "a.exr", rgb(values, "a.") | rgb(values, "b.") | rgb(values, "c.")))
-    (part,) = file.parts
-    with file.cache_strips(10**6):
-        list(file.native_strips(part, 0, 3, [(3, 6)]))
-        assert file._cache.bytes == strip_bytes(HEIGHT)
-        list(file.native_strips(part, 3, 6))
-        assert file._cache.bytes == 0
-    assert len(decoded) == len(set(decoded))
-
-
-@pytest.mark.parametrize("room", [0, 1])
-def test_layers_that_do_not_fit_wait_in_a_file(tmp_path, decoded, room, monkeypatch):
-    """The cache has room for no strip, or for one. No row is decoded twice, and no more memory is taken."""
-    monkeypatch.setattr(strips, "SMALLEST_FILE", 1)
-    values = {name: picture(HEIGHT, WIDTH, seed).astype(np.float16) for seed, name in enumerate("abc")}
-    channels = {key: plane for name, image in values.items() for key, plane in rgb(image, f"{name}.").items()}
-    file = open_exr(write_exr(tmp_path / "a.exr", channels))
-    (part,) = file.parts
-    ranges = [(0, 3), (3, 6), (6, 9)]
-    with file.cache_strips(room * strip_bytes(ROWS_PER_STRIP)):
-        for i, name in enumerate("abc"):
-            rows = np.concatenate([s for _, _, s in file.native_strips(part, *ranges[i], ranges[i + 1 :])])
-            order = [part.channels[j].name[-1] for j in range(*ranges[i])]
-            assert same_bits(np.ascontiguousarray(rows), values[name][..., ["RGB".index(c) for c in order]])
-            assert file._cache.bytes <= room * strip_bytes(ROWS_PER_STRIP)
-            assert all(isinstance(strip.base.base, mmap.mmap) for strip in file._cache._spilled.values())
-    assert len(decoded) == len(set(decoded)) == 5
 
 
 def test_strips_of_many_channels_have_fewer_rows(tmp_path, monkeypatch):

@@ -18,7 +18,6 @@ from oiio_msspl.exr import part_specs
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
-from oiio_msspl.exr.writer import bytes_held
 from tests.conftest import HEADER_ONLY, picture, read_bits, rgb, same_bits, write_exr
 from tests.exr.sources import SOURCES, H, W, behind_a_deep_part, everything, flat, plain, stereo, write_beside, written
 
@@ -206,17 +205,6 @@ def test_multi_part_files_keep_their_parts(tmp_path):
     assert (window.x0, window.y0, window.width, window.height) == (5, -3, 10, 20)
 
 
-@pytest.mark.parametrize(("layers", "is_held"), [((), True), (("id",), False), (("none",), False)])
-def test_only_parts_that_stay_whole_are_held_in_memory(tmp_path, layers, is_held):
-    """One that holds the beauty is split, and so is one of which not all is written."""
-    alone = map_render(open_exr(write_exr(tmp_path / "alone.exr", everything())))
-    assert bytes_held(alone.file, alone.beauty_channels, WriteOptions(layers=layers)) == 0
-    parts, _ = SOURCES["beside"]
-    both = map_render(open_exr(write_exr(tmp_path / "both.exr", parts)))
-    expected = sum(plane.nbytes for plane in parts[1][1].values()) if is_held else 0
-    assert bytes_held(both.file, both.beauty_channels, WriteOptions(layers=layers)) == expected
-
-
 def test_windows_and_metadata_are_kept(tmp_path):
     display = (np.array([0, 0], np.int32), np.array([99, 79], np.int32))
     _, out, _ = written(
@@ -314,7 +302,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.exr.writer import bytes_held, write_fused
+from oiio_msspl.exr.writer import write_fused
 limit = int(sys.argv[2])
 if limit:
     import signal

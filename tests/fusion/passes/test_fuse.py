@@ -98,7 +98,7 @@ def fuse_layers_of(low, high, beauty, aovs=None, **options):
 def pixels_of(result, index=0):
     """A fused layer of the first set, (h, w, 3)."""
     channels = result.jobs[0].layers.layers[index].channels
-    return np.stack([result.pixels.get(channel, 0, HEIGHT) for channel in channels], axis=-1)
+    return np.stack([result.pixels.planes[channel] for channel in channels], axis=-1)
 
 
 def layer(channels, name=""):
@@ -163,7 +163,7 @@ def test_a_beauty_of_halves_is_fitted_in_32_bits(tmp_path):
     for beauty in (half, half.astype(np.float32)):
         result = fuse_layers_of(low, high, beauty)
         channels = [c for layer in result.jobs[0].layers.layers for c in layer.channels]
-        found.append(np.stack([result.pixels.get(channel, 0, HEIGHT) for channel in channels]))
+        found.append(np.stack([result.pixels.planes[channel] for channel in channels]))
     np.testing.assert_array_equal(*found)
 
 
@@ -248,7 +248,7 @@ def test_a_lamp_with_few_samples_leaves_no_dark_specks(tmp_path):
     low, high = (map_render(open_exr(file)) for file in files)
     beauty = np.full((HEIGHT, WIDTH, 3), 0.6, np.float32)
     result = fuse_layers_of(low, high, beauty)
-    found = result.pixels.get(result.jobs[0].layers.layers[1].channels[0], 0, HEIGHT)
+    found = result.pixels.planes[result.jobs[0].layers.layers[1].channels[0]]
     assert found[8:-8, 8:-8].min() > 0.1 * np.median(found)  # a corner has few samples around
 
 
@@ -269,7 +269,7 @@ def test_where_no_layer_has_a_sample_the_beauty_is_divided_as_around(tmp_path, m
     beauty = np.full((384, 128, 3), 0.8, np.float32)
     result = fuse_layers_of(lr, hr, beauty)
     for each in result.jobs[0].layers.layers:
-        found = result.pixels.get(each.channels[0], 0, 384)
+        found = result.pixels.planes[each.channels[0]]
         np.testing.assert_allclose(found, parts[each.name], rtol=1e-3, err_msg=each.name)
 
 
@@ -289,7 +289,7 @@ def test_bands_of_rows_agree(tmp_path, monkeypatch, samples):
         monkeypatch.setattr(bands, "BAND_ROWS", rows)
         beauty = np.full((320, 64, 3), samples, np.float32)
         result = fuse_layers_of(lr, hr, beauty)
-        found.append([result.pixels.get(each.channels[0], 0, 320) for each in result.jobs[0].layers.layers])
+        found.append([result.pixels.planes[each.channels[0]] for each in result.jobs[0].layers.layers])
         np.testing.assert_allclose(sum(found[-1]), samples, rtol=1e-5)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3)
 
@@ -529,7 +529,7 @@ def test_hardly_any_light_in_all_layers_stays_finite(tmp_path):
     beauty = np.full((HEIGHT, WIDTH, 3), 0.1, np.float32)
     result = fuse_layers_of(low, high, beauty)
     channels = [each.channels[0] for each in result.jobs[0].layers.layers]
-    total = sum(result.pixels.get(channel, 0, HEIGHT) for channel in channels)
+    total = sum(result.pixels.planes[channel] for channel in channels)
     np.testing.assert_allclose(total, 0.1, rtol=1e-5)
 
 
@@ -894,6 +894,6 @@ def test_an_lrhs_with_a_wide_filter_does_not_blur_small_lamps(tmp_path):
         lr, hr = maps[low], maps["hr"]
         result = fuse_layers_of(lr, hr, beauty).pixels
         channels = {c.name: c for part in hr.file.parts for c in part.channels}
-        made = np.stack([result.get(channels[f"light_lamps.{c}"], 0, len(lamps)) for c in "RGB"], axis=-1)
+        made = np.stack([result.planes[channels[f"light_lamps.{c}"]] for c in "RGB"], axis=-1)
         errors[low] = np.sqrt(np.mean((made - lamps) ** 2))
     assert errors["wide"] < 1.4 * errors["narrow"]

@@ -7,27 +7,23 @@ only, so the watching thread calls ``nuke.executeInMainThread``.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import tempfile
 import textwrap
 import threading
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, cast
 
 import nuke
 from msspl_bridge import FuseError
 from msspl_bridge.command import Settings, build_command, clean_environment, find_program, split_words
 from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output, parse_range
-from msspl_bridge.passes import ATTRIBUTE, FusedSet, fused_sets
+from msspl_bridge.passes import ATTRIBUTE, fused_sets
 from msspl_bridge.process import Outcome, run
 
 #: Nodes that change neither pixels nor time. They may stand between the Read and the gizmo.
 _PASS_THROUGH = ("Dot", "NoOp", "PostageStamp")
-#: Knobs whose values go into the command line as text.
-_KNOBS = ("quality", "model", "device", "mapping", "layers", "passes", "temporal", "options", "chunk")
 #: What Nuke calls the file that a Read reads, in its metadata.
 _FILE = "input/filename"
 #: A hidden knob on the Read of a result. It holds the name of the node that made the Read.
@@ -61,13 +57,13 @@ def submit_range(node: nuke.Node) -> None:
 def rebuild(node: nuke.Node) -> None:
     """Make a group for each fused set, below the Read of the fused file, that builds the beauty from the layers."""
     try:
-        with _undo_step("Rebuild from passes"), node.parent():
+        with nuke.Undo("Rebuild from passes"), node.parent():
             read = _made_read(node.name())
             if read is None:
                 raise FuseError("nothing is fused yet; fuse a frame first")
             sets = fused_sets(read.metadata(ATTRIBUTE, int(nuke.frame())), read.channels())
-            for column, fused in enumerate(sets):
-                group = _rebuild_group(read, fused)
+            for column, (name, terms) in enumerate(sets.items()):
+                group = _rebuild_group(read, name, terms)
                 group.setXYpos(read.xpos() + 120 * column, read.ypos() + 100)
     except FuseError as error:
         nuke.message(f"{node.name()}: {error}")
@@ -78,7 +74,7 @@ def copy_to_group() -> None:
     gizmos = [n for n in nuke.selectedNodes() if isinstance(n, nuke.Gizmo) and n.knob("fuse_frame")]
     if not gizmos:
         nuke.message("Select an MSSPLFuse gizmo first. A group needs no copy.")
-    with _undo_step("Copy to group"):
+    with nuke.Undo("Copy to group"):
         for gizmo in gizmos:
             name = gizmo.name()
             with gizmo.parent():
@@ -92,18 +88,6 @@ def copy_to_group() -> None:
             group.setXYpos(gizmo.xpos(), gizmo.ypos())
             nuke.delete(gizmo)
             group.setName(name)
-
-
-@contextlib.contextmanager
-def _undo_step(name: str) -> Iterator[None]:
-    """Make all changes of a ``with`` block one step for Undo."""
-    undo = nuke.Undo()
-    undo.begin()
-    undo.name(name)
-    try:
-        yield
-    finally:
-        undo.end()
 
 
 # ---------------------------------------------------------------------------------- start a job, in the main thread
@@ -155,8 +139,8 @@ def _prepare(node: nuke.Node, frame: int | None, on_farm: bool) -> _Job:
         raise FuseError(f"output {out.path}: has no %V or %v, so the views would replace each other")
     program = find_program(_path(node, "program"), os.environ)
     submit = split_words("submit with", _text(node, "submit"))
-    knobs: dict[str, Any] = {knob: _text(node, knob) for knob in _KNOBS}
-    settings = Settings(**knobs, overwrite=bool(node["overwrite"].value()))
+    knobs: dict[str, Any] = {knob.name: _text(node, knob.name) for knob in fields(Settings)}
+    settings = Settings(**knobs | {"overwrite": bool(node["overwrite"].value())})
     commands = []
     for view in views:
         ends = [ReadRange(r.name(), _find_file(r, frames, view), _find_file(r, frames[::-1], view)) for r in reads]
@@ -259,7 +243,7 @@ def _finish(job: _Job, outcome: Outcome) -> None:
     frames = ", ".join(f"{number} {status}" for status, number in outcome.counts.items())
     said = [frames or ("done" if outcome.finished else "not done"), *dict.fromkeys(outcome.notes)]
     lines = [textwrap.fill(text, 90) for text in said] + [outcome.last] * job.on_farm
-    with _undo_step(job.name):
+    with nuke.Undo(job.name):
         job.node["found"].setValue("\n".join(lines))
         if outcome.written or (outcome.finished and not job.on_farm):
             _load(job, node_name, outcome.written)
@@ -306,13 +290,13 @@ def _new_read(node: nuke.Node, node_name: str) -> nuke.Node:
 # ------------------------------------------------------------------------------- rebuild the beauty, in the main thread
 
 
-def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
+def _rebuild_group(read: nuke.Node, name: str, terms: list[list[str]]) -> nuke.Group:
     """Make a group that adds up the layers of a set, and shows the sum or its difference from the beauty.
 
     Every layer has a Shuffle of its own, behind which the artist may put a Grade.
     """
     group = nuke.nodes.Group()
-    group.setName("Rebuild_" + re.sub(r"\W", "_", fused.name))
+    group.setName("Rebuild_" + re.sub(r"\W", "_", name))
     group.setInput(0, read)
     show = nuke.Enumeration_Knob("show", "show", ["rebuild", "difference"])
     show.setTooltip("rebuild: the sum of the layers. difference: how far it is from the fused beauty.")
@@ -326,7 +310,7 @@ def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
     with group:
         source = nuke.nodes.Input()
         total: nuke.Node | None = None
-        for column, term in enumerate(fused.terms):
+        for column, term in enumerate(terms):
             light, *colours = (
                 _node("Shuffle", [source], 120 * column, 100 + 50 * i, **{"in": layer, "label": layer})
                 for i, layer in enumerate(term)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 from msspl_bridge import FuseError
 
-_NUMBER = re.compile(r"%(0?)(\d*)d|#+")
+#: The last frame number in the name of a pattern: ``%04d`` or ``####``.
+_NUMBER = re.compile(r"(?:%(\d*)d|#+)(?!.*(?:%\d*d|#))(?=[^/]*$)")
 _VIEW = re.compile(r"%[vV]")
 
 
@@ -19,27 +20,21 @@ _VIEW = re.compile(r"%[vV]")
 class FrameFile:
     """The file of one frame of a numbered sequence, or a still. ``%V`` and ``%v`` stand for the view."""
 
-    head: str
-    """The path up to the number. For a still, the whole path."""
+    pattern: str
+    """The name of the whole sequence, such as ``/shot/hr.%04d.exr``. Nuke and msspl-fuse both read this form."""
     number: int | None = None
-    """None for a still."""
-    digits: int = 0
-    """The number is padded with zeros to this width."""
-    tail: str = ""
+    """None for a still, whose pattern is its path."""
 
     @property
     def path(self) -> str:
-        return self.head if self.number is None else f"{self.head}{self.number:0{self.digits}d}{self.tail}"
+        return self.pattern if self.number is None else _NUMBER.sub(self._digits, self.pattern)
 
-    @property
-    def pattern(self) -> str:
-        """The name of the whole sequence, such as ``/shot/hr.%04d.exr``. Nuke and msspl-fuse both read this form."""
-        return self.head if self.number is None else f"{self.head}%0{self.digits}d{self.tail}"
+    def _digits(self, token: re.Match[str]) -> str:
+        return f"{self.number:0{int(token[1])}d}"
 
     def in_view(self, view: str) -> FrameFile:
         """Return the file of a view: ``%V`` is its name, ``%v`` its first letter."""
-        head, tail = (part.replace("%V", view).replace("%v", view[:1]) for part in (self.head, self.tail))
-        return replace(self, head=head, tail=tail)
+        return replace(self, pattern=self.pattern.replace("%V", view).replace("%v", view[:1]))
 
 
 @dataclass(frozen=True)
@@ -53,26 +48,24 @@ class ReadRange:
 
 
 def find_number(pattern: str, path: str) -> FrameFile:
-    """Split the path of a frame into head, number and tail.
+    """Find the frame number in the path of a frame.
 
     Args:
         pattern: the file knob of the Read, with ``%04d`` or ``####`` for the number. If it has ``%V`` or ``%v`` for the
-            view, head and tail have it, too.
+            view, the result has it, too.
         path: the file that Nuke found through the pattern.
     """
     pattern, path = with_slashes(pattern), with_slashes(path)
-    folder, expected = posixpath.split(pattern)
+    folder, name = posixpath.split(pattern)
     stereo = bool(_VIEW.search(pattern))
-    folder = folder if stereo else posixpath.dirname(path)
-    tokens = list(_NUMBER.finditer(expected))
-    if not tokens:
+    token = _NUMBER.search(name)
+    if token is None:
         return FrameFile(pattern if stereo else path)
-    token = tokens[-1]
-    before, after = expected[: token.start()], expected[token.end() :]
-    match = re.fullmatch(f"{_match_any_view(before)}(-?[0-9]+){_match_any_view(after)}", posixpath.basename(path))
+    before, after = (_match_any_view(part) for part in (name[: token.start()], name[token.end() :]))
+    match = re.fullmatch(f"{before}(-?[0-9]+){after}", posixpath.basename(path))
     if not match:
         raise FuseError(f"{path}: does not match the pattern {pattern}; rename the file, or correct the Read's file")
-    return FrameFile(posixpath.join(folder, before), int(match[1]), _digits(token), after)
+    return FrameFile(posixpath.join(folder if stereo else posixpath.dirname(path), _with_width(name)), int(match[1]))
 
 
 def parse_range(text: str) -> range:
@@ -94,17 +87,14 @@ def name_output(text: str, hrls: FrameFile, frame: int) -> FrameFile:
     """
     if not text:
         if hrls.number is None:
-            return FrameFile("_fused".join(posixpath.splitext(hrls.head)))
-        plain = hrls.head.rstrip("._-")
-        return replace(hrls, head=f"{plain}_fused{hrls.head[len(plain) :]}")
+            return FrameFile("_fused".join(posixpath.splitext(hrls.pattern)))
+        return replace(hrls, pattern=re.sub(r"(?=[._-]*%\d+d[^/]*$)", "_fused", hrls.pattern, count=1))
     if not os.path.isabs(text):
         raise FuseError(f"output {text}: is a relative path; give the full path, folder included")
-    folder, name = posixpath.split(with_slashes(text))
-    tokens = list(_NUMBER.finditer(name))
-    if not tokens:
-        return FrameFile(with_slashes(text))
-    token, number = tokens[-1], frame if hrls.number is None else hrls.number
-    return FrameFile(posixpath.join(folder, name[: token.start()]), number, _digits(token), name[token.end() :])
+    pattern = _with_width(with_slashes(text))
+    if not _NUMBER.search(pattern):
+        return FrameFile(pattern)
+    return FrameFile(pattern, frame if hrls.number is None else hrls.number)
 
 
 def file_numbers(inputs: Sequence[ReadRange], out: FrameFile, first: int, last: int) -> tuple[int, int]:
@@ -139,5 +129,6 @@ def _match_any_view(text: str) -> str:
     return ".+?".join(re.escape(part) for part in _VIEW.split(text))
 
 
-def _digits(token: re.Match[str]) -> int:
-    return len(token[0]) if token[0].startswith("#") else int(token[2] or 1)
+def _with_width(pattern: str) -> str:
+    """Write the frame number of a pattern with its width, as ``%04d``."""
+    return _NUMBER.sub(lambda token: f"%0{len(token[0]) if token[0][0] == '#' else int(token[1] or 1)}d", pattern)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 from msspl_bridge import FuseError
 
@@ -14,18 +13,10 @@ from msspl_bridge import FuseError
 ATTRIBUTE = "exr/msspl/passes"
 
 
-@dataclass(frozen=True)
-class FusedSet:
-    """Layers whose sum is the fused beauty."""
+def fused_sets(attribute: object, channels: Iterable[str]) -> dict[str, list[list[str]]]:
+    """Return the fused sets of a file that have all their layers, by name, such as ``light groups``.
 
-    name: str
-    """Such as ``light groups``."""
-    terms: list[list[str]]
-    """Nuke's names of the layers. A term is one layer, or light and the colour that it is multiplied by."""
-
-
-def fused_sets(attribute: object, channels: Iterable[str]) -> list[FusedSet]:
-    """Return the fused sets of a file that have all their layers.
+    A set is a list of terms. A term is Nuke's name of a layer, or of light and the colour that it is multiplied by.
 
     Args:
         attribute: value of :data:`ATTRIBUTE`; None in a file without it.
@@ -35,13 +26,12 @@ def fused_sets(attribute: object, channels: Iterable[str]) -> list[FusedSet]:
     if not stored:
         raise FuseError("the file has no fused passes; fuse it again with passes that sum to the beauty")
     layers = {_spelling(layer): layer for layer in (channel.rpartition(".")[0] for channel in channels)}
-    complete, missing = [], []
+    complete, missing = {}, []
     for entry in stored:
         lacking = [name for term in entry["layers"] for name in term if _spelling(name) not in layers]
         missing += [(name, entry["name"]) for name in lacking]
         if not lacking:
-            terms = [[layers[_spelling(name)] for name in term] for term in entry["layers"]]
-            complete.append(FusedSet(entry["name"], terms))
+            complete[entry["name"]] = [[layers[_spelling(name)] for name in term] for term in entry["layers"]]
     if not complete:
         layer, name = missing[0]
         raise FuseError(f"the file has no layer {layer}; fuse it again with all layers of {name}")

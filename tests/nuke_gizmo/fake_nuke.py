@@ -258,14 +258,14 @@ class Undo:
 
     nuke: FakeNuke
 
-    def begin(self):
+    def __init__(self, name):
+        self.name = name
+
+    def __enter__(self):
         assert self.nuke.undo_group is None
-        self.nuke.undo_group = ""
+        self.nuke.undo_group = self.name
 
-    def name(self, name):
-        self.nuke.undo_group = name
-
-    def end(self):
+    def __exit__(self, *exception):
         self.nuke.undo_steps.append(self.nuke.undo_group)
         self.nuke.undo_group = None
 

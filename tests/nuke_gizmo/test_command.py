@@ -13,7 +13,7 @@ from msspl_bridge.frame_files import FrameFile
 
 
 def test_every_knob_reaches_the_command_line():
-    *renders, out = (FrameFile(f"/a/{name}.", 1001, 4, ".exr") for name in ("lr", "hr", "out"))
+    *renders, out = (FrameFile(f"/a/{name}.%04d.exr", 1001) for name in ("lr", "hr", "out"))
     settings = Settings(
         model="paper-x4",
         device="cuda",
@@ -48,7 +48,7 @@ def test_every_knob_reaches_the_command_line():
 
 def test_a_frame_gets_its_neighbours_if_its_files_are_numbered_alike():
     """Otherwise msspl-fuse could not find the neighbours, and the frame is fused by itself."""
-    lrhs, hrls, out = (FrameFile(f"/a/{name}.", 1001, 4, ".exr") for name in ("lr", "hr", "out"))
+    lrhs, hrls, out = (FrameFile(f"/a/{name}.%04d.exr", 1001) for name in ("lr", "hr", "out"))
 
     def command(*files, **settings):
         return build_command("msspl-fuse", files, Settings(**settings))
@@ -57,7 +57,7 @@ def test_a_frame_gets_its_neighbours_if_its_files_are_numbered_alike():
     assert in_shot[1:5] == ["/a/lr.%04d.exr", "/a/hr.%04d.exr", "-o", "/a/out.%04d.exr"]
     assert in_shot[in_shot.index("--frames") :][:4] == ["--frames", "1001", "--temporal", "auto"]
     assert "--skip-existing" not in in_shot  # an existing frame is refused, as one that is fused by itself
-    still, other = FrameFile("/a/still.exr"), FrameFile("/a/lr.", 5, 4, ".exr")
+    still, other = FrameFile("/a/still.exr"), FrameFile("/a/lr.%04d.exr", 5)
     for alone in (
         command(other, hrls, out),
         command(still, hrls, out),
@@ -93,7 +93,7 @@ def test_windows_paths_survive_in_the_options(monkeypatch):
 
 def test_a_job_has_the_options_of_the_range(tmp_path):
     fuse, msspl = tmp_path / "msspl-fuse", tmp_path / "msspl"
-    files = [FrameFile(f"/a/{name}.", 1001, 4, ".exr") for name in ("hr", "out")]
+    files = [FrameFile(f"/a/{name}.%04d.exr", 1001) for name in ("hr", "out")]
     with pytest.raises(FuseError, match=r"there is no msspl beside .*msspl-fuse"):
         build_command(str(fuse), files, Settings(), (1001, 1010), "/job")
     msspl.touch(0o755)

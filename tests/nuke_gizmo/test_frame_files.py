@@ -53,8 +53,8 @@ def test_a_range_is_two_frames_or_one():
 
 
 def test_a_range_is_numbered_as_the_output_files_are():
-    lrhs, hrls = (ReadRange(name, FrameFile(name, 1001, 4), FrameFile(name, 1003, 4)) for name in ("Read1", "Read2"))
-    assert file_numbers([lrhs, hrls], FrameFile("/a/out.", 1001, 4, ".exr"), 1, 3) == (1001, 1003)
+    lrhs, hrls = (ReadRange(name, FrameFile(name, 1001), FrameFile(name, 1003)) for name in ("Read1", "Read2"))
+    assert file_numbers([lrhs, hrls], FrameFile("/a/out.%04d.exr", 1001), 1, 3) == (1001, 1003)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from msspl_bridge import FuseError
-from msspl_bridge.passes import FusedSet, fused_sets
+from msspl_bridge.passes import fused_sets
 
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import open_exr
@@ -111,7 +111,7 @@ def test_layers_are_found_by_the_names_that_nuke_gives_them():
         "View_1_Emit.red",
     ]
     terms = [["View_1_Diffuse_Direct", "view_1_tint"], ["View_1_Emit"]]
-    assert fused_sets(stored, channels) == [FusedSet("components", terms)]
+    assert fused_sets(stored, channels) == {"components": terms}
     with pytest.raises(FuseError, match=r"the file has no layer View\.1\.Emit; fuse it again with all layers"):
         fused_sets(stored, channels[:-1])
     for nothing in (None, "[]"):
@@ -122,11 +122,11 @@ def test_layers_are_found_by_the_names_that_nuke_gives_them():
 def test_a_set_that_lacks_a_layer_is_left_out_and_named_if_it_is_the_only_one():
     names = {"light groups": ["light_1", "light_2"], "components": ["diffuse", "specular"]}
     stored = json.dumps([{"name": name, "layers": [[layer] for layer in layers]} for name, layers in names.items()])
-    lights, parts = (FusedSet(name, [[layer] for layer in layers]) for name, layers in names.items())
+    lights, parts = ({name: [[layer] for layer in layers]} for name, layers in names.items())
     channels = [f"{layer}.red" for layers in names.values() for layer in layers]
-    assert fused_sets(stored, channels) == [lights, parts]
-    assert fused_sets(stored, channels[:-1]) == [lights]
-    assert fused_sets(stored, channels[1:]) == [parts]
+    assert fused_sets(stored, channels) == lights | parts
+    assert fused_sets(stored, channels[:-1]) == lights
+    assert fused_sets(stored, channels[1:]) == parts
     with pytest.raises(FuseError, match="has no layer light_2; fuse it again with all layers of light groups"):
         fused_sets(stored, ["light_1.red", "diffuse.red"])
     alone = json.dumps(json.loads(stored)[1:])

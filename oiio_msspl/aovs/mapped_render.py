@@ -109,7 +109,7 @@ class MappedRender:
         return self.features | ({"alpha": FeatureFormula(((self.alpha,),))} if self.alpha else {})
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """Return features and ``alpha`` over a rectangle, as :meth:`oiio_msspl.exr.render.ReadableRender.read` does.
+        """Return features and ``alpha`` over a rectangle, as :meth:`oiio_msspl.exr.render.Render.read` does.
 
         Channels are contiguous in memory; features of one file may be views of one array.
 
@@ -140,6 +140,7 @@ class MappedRender:
         return result, take(more) if more else pixels[..., :0]
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
+        """Keep decoded rows from one :meth:`read` to the next, see :meth:`ExrFile.cache_strips`."""
         return self.file.cache_strips(max_bytes)
 
     def unload(self) -> None:
@@ -176,6 +177,10 @@ class MappedRender:
         """Raise InputError if pixels that :meth:`load_with` would read can't be decoded."""
         for window in self.data_window.bands(ROWS_PER_LOAD):
             self._read_with(window, features, channels)
+
+
+#: A render that is read by rectangles: a file with its layers mapped, or one in memory.
+ReadableRender = MappedRender | Render
 
 
 def origin(row: Mapping[str, str]) -> str:

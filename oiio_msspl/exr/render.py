@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Define windows (rectangles of pixels), renders in memory, and the protocol of all that is read as features."""
+"""Define windows (rectangles of pixels) and renders in memory."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -107,7 +107,13 @@ class Render:
         return cls({k: np.asarray(v, dtype=np.float32) for k, v in arrays.items()}, window, window, name=name)
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """Return features over a rectangle, as :meth:`ReadableRender.read` does: views if the arrays cover it."""
+        """Return features over a rectangle, float32 (height, width, channels) each; 0 outside of the data window.
+
+        Values are as stored: NaN and infinities may be among them. They are views if the arrays cover the rectangle.
+
+        Args:
+            features: names of features, all if None. Those that the render lacks are left out.
+        """
         inside = window.intersect(self.data_window)
         names = self.layers if features is None else [f for f in features if f in self.layers]
         layers = {name: self.layers[name][inside.slices(self.data_window)] for name in names}
@@ -125,39 +131,3 @@ class Render:
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
         """Do nothing, because the pixels are in memory already."""
         return nullcontext()
-
-
-class ReadableRender(Protocol):
-    """A render that is read by rectangles: a file with its layers mapped, or one in memory."""
-
-    @property
-    def name(self) -> str:
-        """Name for messages, such as the path of the file."""
-
-    @property
-    def display_window(self) -> Window:
-        """The frame that the camera shows."""
-
-    @property
-    def data_window(self) -> Window:
-        """The pixels that were rendered: smaller than the frame for a crop region, larger with overscan."""
-
-    @property
-    def pixel_aspect(self) -> float:
-        """Width of a pixel divided by its height."""
-
-    def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """Return features over a rectangle, float32 (height, width, channels) each; 0 outside of the data window.
-
-        Values are as stored: NaN and infinities may be among them. ``features`` are names of features, all if None;
-        those that the render lacks are left out.
-        """
-
-    def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
-        """Keep at most ``max_bytes`` of decoded rows from one :meth:`read` to the next inside the ``with`` block.
-
-        A file stores rows as wide as the frame, so neighbouring tiles share them.
-        """
-
-    def unload(self) -> None:
-        """Give the memory of pixels that wait in temporary files back to the system."""

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.checks.averages import HrlsAverages, bounded_luminance

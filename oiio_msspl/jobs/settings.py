@@ -8,9 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
-from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapped_render import MappedRender, ReadableRender
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.checks.noise_level import CLEAN_AOVS, CLEAN_AOVS_OF_PAIR, has_clean_aovs, has_little_noise
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread

@@ -33,8 +33,8 @@ from pathlib import Path
 import numpy as np
 
 from oiio_msspl import fuse
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.compare import scores, upsample_bicubic
-from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.model.catalogue import load_model, shipped_models

@@ -17,8 +17,8 @@ from functools import partial
 from pathlib import Path
 
 from oiio_msspl import Render, fuse
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.compare import scores
-from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.jobs.settings import family_for_noise

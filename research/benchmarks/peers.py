@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.compare import upsample_bicubic
-from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.tiles.features import read_features
 from oiio_msspl.image.arrays import Array, clip, repair
 from oiio_msspl.image.filters import box_downsample

@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.exr.render import ReadableRender, Render
+from oiio_msspl.exr.render import Render
 from oiio_msspl.image.arrays import Array, repair
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import find_exposure

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
-from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.fusion.checks.spread_noise import (
     CACHE_BYTES,
     blocks_of,

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.checks.averages import BLOCK, HrlsAverages, bounded_luminance
 from oiio_msspl.fusion.checks.colours import different_colours

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.aovs.mapped_render import ReadableRender
+from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features, read_lrhs
 from oiio_msspl.image.arrays import Array

@@ -15,11 +15,10 @@ from functools import partial
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
-from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapped_render import MappedRender, ReadableRender
 from oiio_msspl.aovs.motion import MotionField, MotionFormat, user_fields
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.motion.camera import Projection, camera_vectors, find_projection
 from oiio_msspl.fusion.motion.flow import flow_vectors, has_optical_flow
 from oiio_msspl.fusion.motion.formats import FEWEST, MARGIN, FieldCheck, check_field, is_silent

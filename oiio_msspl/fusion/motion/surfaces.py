@@ -13,7 +13,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from oiio_msspl.aovs.features import NORMAL
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.aovs.mapped_render import ReadableRender
+from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import grown, means_around, sum_3x3
 from oiio_msspl.image.parallel import for_row_blocks

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import NORMAL
-from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapped_render import MappedRender, ReadableRender
 from oiio_msspl.aovs.motion import MotionFormat
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.filters import grown
 from oiio_msspl.image.parallel import for_row_blocks

@@ -14,7 +14,8 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.exr.render import ReadableRender, Render, Window
+from oiio_msspl.aovs.mapped_render import ReadableRender
+from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.fusion.neighbours.bands import for_bands, rows_in_bands, whole_grid

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
-from oiio_msspl.exr.render import ReadableRender, Render, Window
+from oiio_msspl.aovs.mapped_render import ReadableRender
+from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.checks.averages import BRIGHTEST
 from oiio_msspl.fusion.checks.noise_level import has_clean_aovs
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread

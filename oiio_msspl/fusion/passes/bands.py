@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.exr.render import ReadableRender, Render, Window
+from oiio_msspl.aovs.mapped_render import MappedRender, ReadableRender
+from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.passes.layers import Factor, is_black
 from oiio_msspl.fusion.passes.lines import STEPS, BeautyFit, downsampled, smoothed
 from oiio_msspl.fusion.passes.plan import PassJob

@@ -11,9 +11,9 @@ import numpy as np
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
-from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapped_render import MappedRender, ReadableRender
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import ReadableRender, Render, Window
+from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.image.arrays import has_many_pixels
 
 #: Channels of a colour that light is multiplied by.

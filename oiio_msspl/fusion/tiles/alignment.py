@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.exr.render import Window
 from oiio_msspl.model.contract import ONE_SIZE, SCALES
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import NORMAL, RGB
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.aovs.mapped_render import ReadableRender
+from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, repair

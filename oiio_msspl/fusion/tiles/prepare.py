@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.aovs.mapped_render import ReadableRender
+from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.guards import (

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from oiio_msspl import map_render, open_exr
+from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.image.arrays import Array

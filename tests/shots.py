@@ -41,7 +41,8 @@ def write_png(path, *, overwrite=False):
 
 def contents(folder):
     """{name: bytes}, without the date that OpenImageIO gives a file whose source has none."""
-    return {path.name: re.sub(rb"\d{4}(:\d\d){2} \d\d(:\d\d){2}", b"", path.read_bytes()) for path in folder.iterdir()}
+    files = (path for path in folder.iterdir() if path.is_file())
+    return {path.name: re.sub(rb"\d{4}(:\d\d){2} \d\d(:\d\d){2}", b"", path.read_bytes()) for path in files}
 
 
 def pixels(folder):

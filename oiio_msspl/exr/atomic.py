@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write files atomically: a file appears whole or not at all.
 
-The file is written under a temporary name beside the target, ``.STEM.NAME-MACHINE-PROCESS-RANDOM.tmp.SUFFIX``. NAME is
-a hash of the target's name, MACHINE a hash of the machine on which the process PROCESS runs. So a later run can tell
-whose temporary file it meets, and whether that process still lives.
+The file is written into a hidden folder beside the target, ``.msspl-MACHINE-PROCESS-RANDOM``. MACHINE is a hash of the
+machine on which the process PROCESS runs. So a later run can tell whether the process of a folder that it meets still
+lives.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import secrets
 import shutil
 import socket
 import sys
@@ -24,10 +23,8 @@ from pathlib import Path
 
 from oiio_msspl.errors import InputError, MssplError
 
-#: Bytes of the target's stem in the name of its temporary file. Names may have 143 bytes on encrypted file systems.
-_STEM_BYTES = 60
-#: Seconds after which the files of a process that can't be looked up count as abandoned. A file that is being written
-#: is touched every few seconds, a folder with every frame that is rendered.
+#: Seconds after which the folders of a process that can't be looked up count as abandoned. A file is written in much
+#: less, and the folder of a job is touched with every frame that is rendered.
 _ABANDONED = 24 * 3600
 
 
@@ -98,85 +95,60 @@ def make_folder(folder: Path) -> None:
         raise InputError(f"{folder}: the folder can't be made ({error.strerror})") from error
 
 
-def not_written(folder: Path, reason: str) -> MssplError:
-    """Return the error for a result that could not be written into a folder."""
-    return MssplError(f"{folder}: the result can't be written ({reason}); the target is as it was; is the disk full?")
-
-
 @contextmanager
 def replacing(
     path: Path, *, overwrite: bool = False, before_rename: Callable[[], object] | None = None
 ) -> Iterator[Path]:
     """Give the ``with`` block a temporary file, and rename it to ``path`` when the block ends.
 
-    The temporary file is in the same folder. If the block raises, it is deleted, and ``path`` stays as it was; so too
-    if ``before_rename`` raises, which is called when the file is complete. If ``path`` is a link, the file that it
-    points to is replaced. A file that exists is only replaced with ``overwrite``, and keeps its permissions.
+    The temporary file has the name of ``path``, in a hidden folder beside it. If the block raises, it is deleted, and
+    ``path`` stays as it was; so too if ``before_rename`` raises, which is called when the file is complete. If ``path``
+    is a link, the file that it points to is replaced. A file that exists is only replaced with ``overwrite``, and keeps
+    its permissions.
 
     Raises:
         InputError: without ``overwrite``, a file has appeared at ``path`` meanwhile.
-        MssplError: the file system refused, e.g. because the disk is full; ``path`` is as it was.
+        MssplError: the file system refused, or the block raised OSError; ``path`` is as it was.
     """
     target = Path(os.path.realpath(path))
-    # The suffix of `path`, because a link may point to a name without one, and writers choose the format by it.
-    temporary = target.with_name(f"{_prefix(target)}{_machine()}-{os.getpid()}-{secrets.token_hex(4)}.tmp{path.suffix}")
     try:
-        yield temporary
-        # The pixels must be on the disk before the rename: a crash must not leave half a file under the final name.
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
-        if before_rename is not None:
-            before_rename()
-        if overwrite:
-            if target.exists():
-                os.chmod(temporary, target.stat().st_mode & 0o7777)
-            os.replace(temporary, target)
-        else:
-            _name_if_free(temporary, target)
+        with temporary_folder(target.parent) as folder:
+            temporary = Path(folder, path.name)
+            yield temporary
+            # The pixels must be on the disk before the rename: a crash must not leave half a file under the final name.
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+            if before_rename is not None:
+                before_rename()
+            if overwrite:
+                if target.exists():
+                    os.chmod(temporary, target.stat().st_mode & 0o7777)
+                os.replace(temporary, target)
+            else:
+                _name_if_free(temporary, target)
     except FileExistsError as error:
         raise InputError(f"{path}: appeared while this was computed; pass --overwrite to replace it") from error
     except OSError as error:
         raise MssplError(f"{path}: can't be written ({error.strerror or error}); the target is as it was") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def remove_leftovers(targets: Iterable[Path]) -> None:
-    """Delete the temporary files that killed processes left beside these files.
-
-    Files of living processes stay. A process on another machine can't be looked up, so its file stays for a day.
-    """
-    prefixes: dict[Path, set[str]] = {}
-    for target in targets:
-        real = Path(os.path.realpath(target))
-        prefixes.setdefault(real.parent, set()).add(_prefix(real))
-    for folder, wanted in prefixes.items():
-        with suppress(OSError):
-            for name in os.listdir(folder):
-                match = re.fullmatch(r"(\..*\.[0-9a-f]{8}-)([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.tmp(\..*)?", name)
-                if match and match[1] in wanted and _is_abandoned(folder / name, match[2], int(match[3])):
-                    with suppress(OSError):
-                        (folder / name).unlink()
 
 
 def temporary_folder(folder: Path) -> tempfile.TemporaryDirectory[str]:
     """Make a hidden folder ``.msspl-MACHINE-PROCESS-RANDOM``, deleted when its ``with`` block ends (or OSError)."""
-    return tempfile.TemporaryDirectory(prefix=f".msspl-{_machine()}-{os.getpid()}-", dir=folder.absolute())
+    prefix = f".msspl-{_machine()}-{os.getpid()}-"
+    return tempfile.TemporaryDirectory(prefix=prefix, dir=folder.absolute(), ignore_cleanup_errors=True)
 
 
-def remove_left_folders(folder: Path) -> None:
-    """Delete the folders of :func:`temporary_folder` that killed processes left, by the rule for temporary files."""
-    with suppress(OSError):
-        for name in os.listdir(folder):
-            match = re.fullmatch(r"\.msspl-([0-9a-f]{8})-(\d+)-[^.]+", name)
-            if match and _is_abandoned(folder / name, match[1], int(match[2])):
-                shutil.rmtree(folder / name, ignore_errors=True)
+def remove_leftovers(targets: Iterable[Path]) -> None:
+    """Delete the temporary folders that killed processes left beside these files.
 
-
-def _prefix(target: Path) -> str:
-    """Return the beginning of the names of a target's temporary files."""
-    stem = os.fsencode(target.stem)[:_STEM_BYTES].decode("utf-8", "ignore")
-    return f".{stem}.{_hash(target.name)}-"
+    Those of living processes stay. A process on another machine can't be looked up, so its folder stays for a day.
+    """
+    for folder in {Path(os.path.realpath(target)).parent for target in targets}:
+        with suppress(OSError):
+            for name in os.listdir(folder):
+                match = re.fullmatch(r"\.msspl-([0-9a-f]{8})-(\d+)-[^.]+", name)
+                if match and _is_abandoned(folder / name, match[1], int(match[2])):
+                    shutil.rmtree(folder / name, ignore_errors=True)
 
 
 @lru_cache(maxsize=1)
@@ -186,11 +158,7 @@ def _machine() -> str:
     names = [socket.gethostname()]
     with suppress(OSError):
         names += [Path("/proc/sys/kernel/random/boot_id").read_text(), os.readlink("/proc/self/ns/pid")]
-    return _hash(" ".join(names))
-
-
-def _hash(text: str) -> str:
-    return sha256(os.fsencode(text)).hexdigest()[:8]
+    return sha256(os.fsencode(" ".join(names))).hexdigest()[:8]
 
 
 def _is_abandoned(temporary: Path, machine: str, process: int) -> bool:

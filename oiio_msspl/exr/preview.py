@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
+from oiio_msspl.exr.reader import reason_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
 from oiio_msspl.image.arrays import Array
@@ -93,7 +94,7 @@ def write_preview(
     with replacing(path, overwrite=overwrite) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
         if writer is None:
-            raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
+            raise OSError(reason_of(oiio))
         spec = oiio.ImageSpec(display_window.width, display_window.height, 3, "uint8")
         spec.attribute("oiio:ColorSpace", "sRGB")
         spec.attribute("Software", SOFTWARE)
@@ -109,12 +110,12 @@ def write_preview(
             ok = ok and writer.write_scanlines(strip.y0 - display_window.y0, strip.y1 - display_window.y0, 0, pixels)
         ok = writer.close() and ok
         if not ok:
-            raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")
+            raise OSError(reason_of(writer))
         # OpenImageIO does not tell if a full disk cut off the last bytes.
         with open(temporary, "rb") as file:
             file.seek(-min(len(PNG_END), temporary.stat().st_size), os.SEEK_END)
             if file.read() != PNG_END:
-                raise MssplError(f"{path}: can't be written (its end is missing); is the disk full?")
+                raise OSError("its end is missing; is the disk full?")
 
 
 def _to_8_bits(display: Array) -> Pixels:

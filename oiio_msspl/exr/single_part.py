@@ -13,7 +13,6 @@ from typing import Any
 from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import not_written
 from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.write_options import COMPONENTS
@@ -29,13 +28,15 @@ def write_single_part(path: Path, contents: FileContents) -> None:
     """Write all channels into one part of the file ``path``."""
     import OpenEXR
 
-    channels = _fused_channels(contents) | _passed_on_channels(contents)
+    channels, names = _fused_channels(contents), channel_names(contents)
+    for part, passed_on in contents.passed_on:
+        channels |= {names[c]: plane for c, plane in contents.planes(part, passed_on, on_disk=False).items()}
     header = _header(contents)
     try:
         with OpenEXR.File(header, channels) as file:
             file.write(str(path))
     except Exception as error:
-        raise not_written(path.parent, str(error)) from error
+        raise OSError(str(error)) from error
 
 
 def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
@@ -46,13 +47,6 @@ def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
         names = [f"{name}.{component}" for component in COMPONENTS[name]]
         channels |= zip(names, planes_of(contents.extra_rows(name, 0, height)), strict=True)
     return channels
-
-
-def _passed_on_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
-    """Return the channels of the HRLS that are neither fused nor dropped, (height, width) by name."""
-    names = channel_names(contents)
-    planes = (contents.planes(part, channels, on_disk=False) for part, channels in contents.passed_on)
-    return {names[channel]: plane for part in planes for channel, plane in part.items()}
 
 
 def channel_names(contents: FileContents) -> dict[Channel, str]:

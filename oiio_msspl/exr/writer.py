@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the result: the fused beauty first, then the layers of the HRLS that are passed on, bit for bit.
-
-These layers keep their pixel types.
-"""
+"""Write the result: the fused beauty first, then the layers of the HRLS that are passed on, bit for bit."""
 
 from __future__ import annotations
 
@@ -18,15 +15,10 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import not_written, replacing
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.contents import FileContents, dropped_channels, without_alpha_apart
-from oiio_msspl.exr.part_specs import (
-    beauty_spec,
-    extra_spec,
-    passed_on_parts,
-    share_attributes,
-)
+from oiio_msspl.exr.part_specs import beauty_spec, extra_spec, passed_on_parts, share_attributes
 from oiio_msspl.exr.reader import Channel, ExrFile, open_exr, reason_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -91,7 +83,7 @@ def write_fused(
             write_single_part(temporary, contents)
         else:
             _write_parts(temporary, contents)
-        _check_whole(temporary, path, contents.compression)
+        _check_whole(temporary, contents.compression)
     return warnings
 
 
@@ -137,7 +129,7 @@ def _write_parts(path: Path, contents: FileContents) -> None:
 
     writer = oiio.ImageOutput.create(str(path))
     if writer is None:
-        raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
+        raise OSError(reason_of(oiio))
     ok = writer.open(str(path), specs if len(specs) > 1 else beauty)
     ok = ok and _write_rows(writer, beauty, contents.rows)
     for name, spec in extra.items():
@@ -155,10 +147,10 @@ def _write_parts(path: Path, contents: FileContents) -> None:
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
-        raise not_written(path.parent, reason_of(writer) if writer.has_error else "no reason given")
+        raise OSError(f"{reason_of(writer)}; is the disk full?")
 
 
-def _check_whole(temporary: Path, path: Path, compression: str) -> None:
+def _check_whole(temporary: Path, compression: str) -> None:
     """Read the first and last row of every part: OpenImageIO does not tell if a full disk cut off the file's end.
 
     Nor does it tell that it lacks a compression, and writes zip.
@@ -171,7 +163,7 @@ def _check_whole(temporary: Path, path: Path, compression: str) -> None:
                 for y in (window.y0, window.y1 - 1):
                     file.read(part.channels[:1], Window(window.x0, y, window.x1, y + 1))
     except InputError as error:
-        raise not_written(path.parent, "its end is missing") from error
+        raise OSError("its end is missing; is the disk full?") from error
     if written != compression:
         raise InputError(f"--compression {compression}: this OpenImageIO writes {written} instead; name another one")
 

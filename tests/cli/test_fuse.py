@@ -272,7 +272,7 @@ def test_a_signal_leaves_nothing_half_written(tmp_path, bilinear_models, name, e
     process = start(
         [sys.executable, "-c", code, tmp_path / "lr.exr", tmp_path / "hr.exr", "-o", tmp_path / "out.exr", *options]
     )
-    while not any(path.stat().st_size > 1000 for path in tmp_path.glob(".out.*")):
+    while not any(path.stat().st_size > 1000 for path in tmp_path.glob(".msspl-*/*")):
         assert process.poll() is None, process.communicate()
         time.sleep(0.001)
     process.send_signal(getattr(signal, name))

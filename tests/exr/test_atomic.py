@@ -65,15 +65,13 @@ def test_targets_are_checked_before_any_work(tmp_path):
 
 
 def test_leftovers_of_killed_runs_are_removed_and_nothing_else(tmp_path):
-    """The temporary file of a process that died goes. Those of other targets stay, and so do files of similar names."""
-    target = tmp_path / "out.exr"
-    gone = leave_temporary(target)
-    names = (".out.12.tmp.exr", ".out.x.tmp.exr", "out.exr", gone.name.replace(".out.", ".in."))
-    kept = [leave_temporary(tmp_path / "other.exr"), leave_temporary(tmp_path / "out.png")]
-    for name in names:
-        (tmp_path / name).write_text("kept")
-    remove_leftovers([target])
-    assert sorted(tmp_path.iterdir()) == sorted([*kept, *(tmp_path / name for name in names)])
+    """The temporary folder of a process that died goes, whatever it wrote. Files and folders of similar names stay."""
+    leave_temporary(tmp_path / "out.exr")
+    leave_temporary(tmp_path / "other.exr")
+    (tmp_path / ".msspl-notes").mkdir()
+    (tmp_path / "out.exr").write_text("kept")
+    remove_leftovers([tmp_path / "out.exr"])
+    assert sorted(os.listdir(tmp_path)) == [".msspl-notes", "out.exr"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="on Windows only the age counts")
@@ -82,7 +80,7 @@ def test_a_temporary_file_that_a_living_process_writes_stays(tmp_path):
     target = tmp_path / "out.exr"
     with replacing(target) as temporary:
         temporary.write_text("half")
-        os.utime(temporary, (0, 0))
+        os.utime(temporary.parent, (0, 0))
         remove_leftovers([target])
         assert temporary.exists()
     assert target.exists()
@@ -92,10 +90,10 @@ def test_a_process_on_another_machine_is_taken_for_dead_after_a_day(tmp_path, mo
     target = tmp_path / "out.exr"
     monkeypatch.setattr(atomic, "_machine", lambda: "0123abcd")
     new, old = leave_temporary(target), leave_temporary(target)
-    os.utime(old, (time.time() - 25 * 3600,) * 2)
+    os.utime(old.parent, (time.time() - 25 * 3600,) * 2)
     monkeypatch.undo()
     remove_leftovers([target])
-    assert list(tmp_path.iterdir()) == [new]
+    assert list(tmp_path.iterdir()) == [new.parent]
 
 
 @pytest.mark.parametrize("name", ["x" * 251 + ".exr", "ä" * 125 + ".exr"])
@@ -213,11 +211,11 @@ def test_on_windows_only_the_age_of_a_temporary_file_counts(tmp_path, monkeypatc
     """There, os.kill(process, 0) would end the process."""
     target = tmp_path / "out.exr"
     new, old = leave_temporary(target), leave_temporary(target)
-    os.utime(old, (time.time() - 25 * 3600,) * 2)
+    os.utime(old.parent, (time.time() - 25 * 3600,) * 2)
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(os, "kill", lambda *arguments: pytest.fail("would end a process"))
     remove_leftovers([target])
-    assert list(tmp_path.iterdir()) == [new]
+    assert list(tmp_path.iterdir()) == [new.parent]
 
 
 def test_a_machine_has_a_name_without_the_files_of_linux(monkeypatch):

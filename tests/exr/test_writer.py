@@ -357,7 +357,7 @@ def test_killed_half_way_the_old_file_is_whole(tmp_path):
 def test_an_unwritable_path_is_our_failure_not_a_traceback(tmp_path, monkeypatch):
     hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W)))))
     monkeypatch.setattr(oiio.ImageOutput, "create", staticmethod(lambda path: None))
-    with pytest.raises(MssplError, match="OpenImageIO can't write it"):
+    with pytest.raises(MssplError, match=r"out\.exr: can't be written"):
         write_beside(hr)
 
 

@@ -168,7 +168,6 @@ def render(
     }
     atomic.make_folder(output.parent)
     atomic.remove_leftovers(path for _, path in shot)
-    atomic.remove_left_folders(output.parent)
     printer = _Printer(fused, quiet, verbose=bool(verbose), keep=keep)
 
     def show(event: dict[str, Any]) -> None:

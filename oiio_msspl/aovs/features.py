@@ -9,7 +9,7 @@ Units:
 - ``rgb``, ``diffuse``, ``specular``: scene-linear radiance, >= 0.
 - ``albedo``: reflectance, mostly in [0, 1].
 - ``normal``: signed vector in [-1, 1], in world or camera space; 0 where the camera ray hits nothing.
-- ``variance``: variance of the pixel's *mean* luminance (radiance squared), >= 0.
+- ``variance``: variance of the pixel's *mean* (radiance squared), >= 0: one channel of luminance, or R, G and B.
 """
 
 from __future__ import annotations

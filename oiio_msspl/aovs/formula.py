@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute a feature from the channels of a file.
 
-Composites follow the paper's equations, variances become the variance of luminance, and normals become signed vectors.
+Composites follow the paper's equations, and normals become signed vectors.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.image.arrays import Array
-from oiio_msspl.image.colour import luminance
 
 #: Gives the pixels of some channels, (height, width, len(channels)).
 Take = Callable[[Sequence[Channel]], Array]
@@ -45,7 +44,7 @@ class FeatureFormula:
         return len(self.terms) > 1 or self.factor is not None
 
     def evaluate(self, take: Take) -> Array:
-        """Return the feature, unless it is a variance: float32 (height, width, 3), in the units of the features."""
+        """Return the feature: float32 (height, width, channels), in the units of the features."""
         value = reduce(np.add, map(take, self.terms))
         if self.factor is not None:
             value = value * take(self.factor)
@@ -54,14 +53,3 @@ class FeatureFormula:
         normal = value * 2 - 1
         normal[~value.any(axis=-1)] = 0  # renderers store an empty background as 0, which no normal is
         return normal
-
-    def evaluate_variance(self, take: Take) -> Array:
-        """Return the variance of the pixel's mean luminance, (height, width, 1).
-
-        A variance of colours is turned into one of luminance as if the noise of R, G and B were fully correlated:
-        sigma_Y = sum of w_c sigma_c. Monte Carlo noise nearly is, because one path carries all three.
-        """
-        value = take(self.terms[0])
-        if value.shape[-1] == 1:
-            return value
-        return np.square(luminance(np.sqrt(np.maximum(value, 0))))[..., None]

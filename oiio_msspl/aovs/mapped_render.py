@@ -93,6 +93,13 @@ class MappedRender:
         rows.append(("alpha", "found", self.alpha.name, "") if self.alpha else ("alpha", "absent", "", ""))
         return [dict(zip(("feature", "status", "source", "note"), row, strict=True)) for row in rows]
 
+    def features_read(self, read: Collection[str], *, alone: bool) -> list[str]:
+        """Return the features that a model reads (``read``), and what else is read of a render that is fused alone.
+
+        That is the variance, if there is one: nothing else tells how much noise a pixel has.
+        """
+        return [*read, *([VARIANCE] if alone and VARIANCE in self.features and VARIANCE not in read else [])]
+
     def for_model(self, read: Collection[str]) -> MappedRender:
         """Return the render without the features that only the paper's network reads, and without notes about them.
 
@@ -136,7 +143,7 @@ class MappedRender:
         result: dict[str, Array] = {}
         with np.errstate(all="ignore"):  # the caller repairs and counts NaN and infinities
             for name, formula in formulas.items():
-                result[name] = formula.evaluate_variance(take) if name == VARIANCE else formula.evaluate(take)
+                result[name] = formula.evaluate(take)
         return result, take(more) if more else pixels[..., :0]
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:

@@ -12,7 +12,8 @@ import numpy as np
 
 from oiio_msspl.image.arrays import Array, unload
 
-#: Features of a render in memory and their numbers of channels. :mod:`oiio_msspl.aovs.features` states their units.
+#: Features of a render in memory and their numbers of channels; a variance may also have three.
+#: :mod:`oiio_msspl.aovs.features` states their units.
 CHANNELS = {"rgb": 3, "albedo": 3, "normal": 3, "diffuse": 3, "specular": 3, "variance": 1, "alpha": 1}
 
 
@@ -98,7 +99,8 @@ class Render:
         for key, value in arrays.items():
             if key not in CHANNELS:
                 raise ValueError(f"{name}: layer {key!r} is none of {', '.join(CHANNELS)}")
-            if value.shape != (height, width, CHANNELS[key]) or not value.size:
+            count = 3 if key == "variance" and value.shape[2:] == (3,) else CHANNELS[key]
+            if value.shape != (height, width, count) or not value.size:
                 size = f"{height}, {width}" if height else "height, width"
                 raise ValueError(f"{name}: layer {key!r} has shape {value.shape}, expected ({size}, {CHANNELS[key]})")
             if not np.issubdtype(value.dtype, np.floating):

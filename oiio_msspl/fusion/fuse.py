@@ -111,7 +111,7 @@ def fuse(
         rgb: NDArray[Any] = blank((*size, 3), np.float16 if half else np.float32, on_disk=False)
         errors: Array | None = blank((*size, 1), on_disk=False) if error else None
         frame = FusedFrame(rgb, None, errors, alignment, pair.exposure, {})
-        if trust and session.contract.denoiser and lr is not hr:
+        if trust and session.contract.denoiser and pair.tells_noise:
             frame.trust = blank((alignment.grid.height, alignment.grid.width), on_disk=False)
         with hr.cache_strips(strips_memory(max_memory, held)):
             for task in fuse_tiles(tile_tasks(pair, frame), session):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from oiio_msspl.aovs.features import ALBEDO
+from oiio_msspl.aovs.features import ALBEDO, VARIANCE
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.tiles.alignment import align
@@ -18,7 +18,7 @@ NEIGHBOURS = 2.66
 #: PSNR in dB of a lit display at 64 and 16 spp: without what both renders show, and with it.
 BOTH_SHOW = 17.6, 49.3
 #: PSNR in dB at 2 spp of noise that a wide pixel filter has spread: OIDN's, and ours.
-SPREAD_NOISE = (21.20, 32.39)
+SPREAD_NOISE = (21.20, 32.40)
 #: From so many samples per pixel of the HRLS on, most samples belong there; the LRHS then has at most this share.
 MANY_SPP, LARGEST_SHARE = 3, 1 / 3
 
@@ -51,12 +51,13 @@ def advise(lr: MappedRender, hr: MappedRender, spread: bool | None, *, in_shot: 
             f"filter, the noise is removed all the same ({ours:.1f} dB at 2 spp, where OIDN reaches {oidn:.1f})"
         )
         advice.append(Finding("box_filter", text))
-    if lr is hr:
+    if lr is hr and VARIANCE not in hr.features:
         without, with_both = BOTH_SHOW
         text = (
-            "render half of the samples with another seed, as a second file: it costs no samples, but the scene is "
-            "loaded twice. Detail that no AOV shows, such as screens and thin shadows, is kept where two renders show "
-            f"it (a lit display at 64 and 16 spp: {with_both} dB, and {without} by the network alone)"
+            "render half of the samples with another seed, as a second file, or the variance of each pixel's mean as a "
+            "layer: they cost no samples. Detail that no AOV shows, such as screens and thin shadows, is kept where "
+            f"they tell it from noise (a lit display at 64 and 16 spp: {with_both} dB, and {without} by the network "
+            "alone)"
         )
         advice.append(Finding("second_seed", text))
     if not spread and (lr is hr or scale != ONE_SIZE):  # sizes were compared with independent noise

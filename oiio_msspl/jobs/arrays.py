@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import not_written
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.write_options import WriteOptions
@@ -42,6 +41,7 @@ def fuse_arrays(
     albedo: Array | None = None,
     normal: Array | None = None,
     alpha: Array | None = None,
+    variance: Array | None = None,
     quality: str = DEFAULT_QUALITY,
     device: str = "cpu",
     threads: int = 0,
@@ -56,6 +56,8 @@ def fuse_arrays(
             3) with s = 2, 4 or 8, or one of the same size. None if there is one render.
         albedo, normal: of ``hr``, (height, width, 3); normals from -1 to 1.
         alpha: of ``hr``, (height, width, 1). It is fused if there is one render, and else kept.
+        variance: of the pixels' means of ``hr``, (height, width, 3). It keeps detail of one render that no other layer
+            shows.
         quality: ``fast``, ``balanced`` or ``best``.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
@@ -70,8 +72,8 @@ def fuse_arrays(
     if quality not in QUALITIES:
         raise InputError(f"quality {quality!r}: use one of {', '.join(QUALITIES)}")
     aovs = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
-    layers = {"rgb": hr, **aovs} | ({} if alpha is None else {"alpha": alpha})
-    high = Render.from_arrays("hr", **layers)
+    more = {name: image for name, image in (("alpha", alpha), ("variance", variance)) if image is not None}
+    high = Render.from_arrays("hr", rgb=hr, **aovs, **more)
     low = high if lr is None else Render.from_arrays("lr", rgb=lr)
     alignment = align(low, high)
     family = QUALITIES[quality if aovs else min(quality, DEFAULT_QUALITY, key=list(QUALITIES).index)]
@@ -93,6 +95,8 @@ class ArrayFrame:
     """(height, width, 3), from -1 to 1."""
     alpha: Array | None = None
     """(height, width, 1)."""
+    variance: Array | None = None
+    """(height, width, 3), of the pixels' means."""
     motion: Array | None = None
     """(height, width, 2): from a pixel to the place of its surface in the next frame, in pixels, as (x, y) with y
     downwards. NaN where it is not known."""
@@ -147,7 +151,7 @@ def fuse_array_shot(
         number, with_lr, moves = 0, False, False
         for number, frame in enumerate(frames, 1):
             names, with_lr = list(frame.passes), frame.lr is not None
-            aovs = {"albedo": frame.albedo, "normal": frame.normal, "alpha": frame.alpha}
+            aovs = {name: getattr(frame, name) for name in ("albedo", "normal", "alpha", "variance")}
             motion = {} if frame.motion is None else {"motion": np.asarray(frame.motion)}
             moves |= any(np.any(vectors) for vectors in motion.values())
             _write(folder / f"hr/hr.{number:04d}.exr", frame.hr, aovs, {**frame.passes, **motion})
@@ -194,7 +198,7 @@ def _write(path: Path, rgb: Array, aovs: Mapping[str, Array | None], layers: Map
         with OpenEXR.File(header, planes) as file:
             file.write(str(path))
     except Exception as error:
-        raise not_written(path.parent, str(error)) from error
+        raise MssplError(f"{path}: can't be written ({error}); is the disk full?") from error
 
 
 def _read(path: str, passes: Sequence[str], warnings: list[Finding]) -> FusedArrays:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
 
-from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, VARIANCE
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
@@ -36,6 +36,7 @@ from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key
+from oiio_msspl.model.contract import ONE_SIZE
 from oiio_msspl.model.session import Session
 
 
@@ -240,8 +241,9 @@ def _budget(frames: Sequence[ShotFrame], settings: Settings, *, missing: int) ->
 
 
 def features_read(session: Session) -> list[str]:
-    """Return the features that a model reads of either render, and those that tell what a pixel shows."""
-    return list(dict.fromkeys([*session.contract.hrls, *session.contract.lrhs, ALBEDO, NORMAL, "alpha"]))
+    """Return the features that a model reads of either render, and those that tell what a pixel shows, or its noise."""
+    variance = [VARIANCE] if session.contract.scale == ONE_SIZE else []
+    return list(dict.fromkeys([*session.contract.hrls, *session.contract.lrhs, ALBEDO, NORMAL, "alpha", *variance]))
 
 
 def _read_pixels(frame: ShotFrame) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB, is_light_of_pass
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
@@ -145,8 +145,7 @@ def light_features(render: MappedRender) -> list[str]:
 
 
 def _channels(render: MappedRender, features: Sequence[str]) -> int:
-    counts = [HRLS_FEATURES.get(name, 3) for name in render.features if name in features]
-    return sum(counts) + (render.alpha is not None)
+    return 3 * sum(name in features for name in render.features) + (render.alpha is not None)
 
 
 def _vector_bytes(render: MappedRender, channels: Sequence[Channel]) -> int:

@@ -61,7 +61,7 @@ class FrameReport:
     """Wall time in seconds: ``read`` opens both files and loads the model, ``fuse`` reads pixels and fuses them,
     ``network`` is the part of ``fuse`` that the model's network took, and ``write`` writes EXR and preview."""
     features: frozenset[str]
-    """Features of the HRLS that the model reads."""
+    """Features of the HRLS that are read."""
     clipped: int = 0
     """Number of fused values that half could not hold; 0 if the beauty is stored as float."""
     lrhs_aovs: tuple[str, ...] = ()
@@ -69,7 +69,8 @@ class FrameReport:
     passes: dict[str, str] = field(default_factory=dict)
     """A sentence on each additive set, by name: fused or passed on."""
     trust: float | None = None
-    """Mean share of what the network had removed and was put back because both renders show it; None without trust."""
+    """Mean share of what the network had removed and was put back, because both renders show it, or because the only
+    render does by its variance; None without trust."""
     frames_counted: float | None = None
     """How many frames a pixel is the mean of, in the mean over the first view; None without neighbours."""
     network_seconds: float = 0.0
@@ -158,9 +159,10 @@ def report_on(
     if ALBEDO in session.contract.hrls and ALBEDO not in hr.features:
         text = "no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"
         warnings.insert(0, Finding("no_albedo", text))
+    read = hr.features_read(session.contract.hrls, alone=lr.file is hr.file and fused.trust is not None)
     return FrameReport(
         lr=lr,
-        hr=hr.for_model(session.contract.hrls),
+        hr=hr.for_model(read),
         scale=fused.alignment.scale,
         model=session.name,
         weights=session.weights,
@@ -173,7 +175,7 @@ def report_on(
         warnings=[*warnings, *fused.warnings, *_pass_warnings(hr, fused)],
         tiles=fused.tiles,
         seconds={},
-        features=frozenset(session.contract.hrls),
+        features=frozenset(read),
         lrhs_aovs=tuple(session.contract.lrhs[1:]),
         passes=_passes(fused),
         trust=None if fused.trust is None else float(fused.trust.mean()),

@@ -140,6 +140,17 @@ def _expm1(values: Array) -> None:
     np.copyto(values, power, where=logarithm != 0)
 
 
+def luminance_variance(variance: Array) -> Array:
+    """Return a variance of luminance (h, w, 1), of one of luminance or of colours (h, w, 1 or 3).
+
+    The noise of R, G and B is taken for fully correlated: sigma_Y = sum of w_c sigma_c. Monte Carlo noise nearly is,
+    because one path carries all three.
+    """
+    if variance.shape[-1] == 1:
+        return variance
+    return np.square(luminance(np.sqrt(np.maximum(variance, 0))))[..., None]
+
+
 def default_value(feature: str, exposure: float) -> float:
     """Return the value of a missing feature, in the units of :mod:`oiio_msspl.aovs.features`."""
     if feature != VARIANCE:

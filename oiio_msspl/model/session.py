@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, VARIANCE
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.image.parallel import check_threads
 from oiio_msspl.model.contract import CLEAN, Contract
 from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
 from oiio_msspl.model.digests import digests
-from oiio_msspl.model.encoding import default_value
+from oiio_msspl.model.encoding import default_value, luminance_variance
 from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.runtime import CPU, convolutions, load_network, release_memory
 
@@ -189,7 +189,8 @@ class Session:
                 continue
             images = lrhs if render == "lrhs" else hrls
             if name in images:
-                feed[key] = np.ascontiguousarray(images[name].transpose(2, 0, 1)[None], np.float32)
+                image = luminance_variance(images[name]) if name == VARIANCE else images[name]
+                feed[key] = np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
             else:
                 size = 1, channels, *images[RGB].shape[:2]
                 feed[key] = np.full(size, default_value(name, exposure), np.float32)

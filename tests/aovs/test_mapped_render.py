@@ -7,16 +7,19 @@ from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
+from oiio_msspl.model.encoding import luminance_variance
 from tests.aovs.renders import H, W, layer, mapped, plane, sources
 from tests.conftest import EXAMPLES, SHARED, needs_shared, picture, rgb, write_exr
 
 
 @pytest.mark.parametrize("entry", ["v", {"channels": ["v.R", "v.G", "v.B"]}])
-def test_a_variance_of_colours_becomes_one_of_luminance(tmp_path, entry):
+def test_a_variance_of_colours_stays_one_and_has_one_of_luminance(tmp_path, entry):
     channels = layer("", 1) | {"v.R": plane(0.04), "v.G": plane(0.09), "v.B": plane(0.16)}
     render = mapped(tmp_path, channels, {"variance": entry})
+    variance = render.read(render.data_window)["variance"]
+    np.testing.assert_allclose(variance[0, 0], [0.04, 0.09, 0.16], rtol=1e-3)
     expected = (0.2126 * 0.2 + 0.7152 * 0.3 + 0.0722 * 0.4) ** 2
-    np.testing.assert_allclose(render.read(render.data_window)["variance"], expected, rtol=1e-3)
+    np.testing.assert_allclose(luminance_variance(variance), expected, rtol=1e-3)
 
 
 def test_a_luminance_variance_is_taken_as_it_is(tmp_path):

@@ -158,6 +158,24 @@ def test_arrays_choose_their_model(sigma, monkeypatch):
         fuse_arrays(images["rgb"], quality="good")
 
 
+def test_a_variance_keeps_what_no_aov_shows():
+    """Flakes that only the light shows stay, and noise does not come back."""
+    rng = np.random.default_rng(3)
+    clean = np.full((HEIGHT, WIDTH, 3), 0.4, np.float32)
+    clean[:, 90:] *= rng.uniform(0.5, 1.5, (HEIGHT, WIDTH - 90, 1))
+    samples = 64
+    rendered = (clean * rng.gamma(samples, 1 / samples, (HEIGHT, WIDTH, 3))).astype(np.float32)
+    variance = np.square(clean) / np.float32(samples)
+    aovs = {"albedo": np.full_like(clean, 0.5), "normal": np.full_like(clean, 0.5)}
+    kept, lost = fuse_arrays(rendered, **aovs, variance=variance), fuse_arrays(rendered, **aovs)
+    flakes, wall = np.s_[8:-8, 98:-8], np.s_[8:-8, 8:50]
+    rms = [[np.sqrt(np.square(i[part] - clean[part]).mean()) for part in (flakes, wall)] for i in (kept.rgb, lost.rgb)]
+    assert lost.trust is None and kept.trust[flakes].mean() > 0.3 > 0.05 > kept.trust[wall].mean()
+    assert rms[0][0] < 0.6 * rms[1][0] and rms[0][1] < 1.02 * rms[1][1]
+    for untold in (np.zeros_like(variance), variance[..., :1]):  # of single samples, and of luminance
+        assert fuse_arrays(rendered, **aovs, variance=untold).trust is None
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (3, 5), (33, 47)])
 def test_any_size_will_do(size):
     session = load_model(1, "fast", threads=1)

@@ -58,7 +58,7 @@ def test_one_render_is_told_of_a_second_seed_and_not_of_a_small_render(tmp_path)
     high = write(tmp_path / "hr.exr", noisy(picture(64, 64), 4))
     found = {text.code: text for text in check_files(None, high).advice}
     assert found.keys() == {"second_seed", "no_lrhs"}
-    assert "costs no samples" in found["second_seed"] and "0.2 to 1.5 dB" in found["no_lrhs"]
+    assert "cost no samples" in found["second_seed"] and "0.2 to 1.5 dB" in found["no_lrhs"]
 
 
 def test_a_pair_is_told_where_its_samples_belong(tmp_path):

@@ -252,7 +252,8 @@ def _print(report: FrameReport, seconds: float) -> None:
     for name, outcome in report.passes.items():
         console.say(f"  {name}: {outcome}")
     if report.trust is not None and report.trust >= 0.005:
-        console.say(f"Put back {report.trust:.0%} of what the network had removed: both renders show it.")
+        why = "its variance tells that it is no noise" if report.is_one_render else "both renders show it"
+        console.say(f"Put back {report.trust:.0%} of what the network had removed: {why}.")
     for text, counts in (
         ("Repaired values that were NaN or infinite", report.repaired),
         ("Set negative values to 0 (colours out of gamut)", report.negative),

@@ -25,7 +25,7 @@ from oiio_msspl.fusion.tiles.guards import (
 )
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile, alpha_as_colour
 from oiio_msspl.fusion.tiles.tiling import Tile
-from oiio_msspl.fusion.tiles.trust import trust_renders
+from oiio_msspl.fusion.tiles.trust import halves_of, trust_renders
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
 from oiio_msspl.image.filters import all_within, box_downsample, enlarged
 from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
@@ -170,14 +170,18 @@ def _fuse_alpha(tile: TileFeatures, session: Session, shares: Shares, *, trust: 
 
 def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shares, reach: int) -> Array:
     """Return the picture of a tile with the detail and the light that both renders show."""
-    if result.trust is None or tile.noise_free or RGB not in shares:
+    if result.trust is None or tile.noise_free:
         return fused
     assert tile.lrhs is not None and tile.hrls is not None
-    lrhs, borrowed, scale = tile.lrhs[RGB], tile.features.borrowed, tile.features.scale
+    lrhs, hrls, share = tile.lrhs[RGB], tile.hrls[RGB], shares.get(RGB, 0.5)
+    borrowed, scale = tile.features.borrowed, tile.features.scale
+    if tile.variance is not None:
+        lrhs, hrls = halves_of(hrls, tile.variance)
     if borrowed is not None:
         lrhs = np.where(borrowed[..., None], box_downsample(fused, scale), lrhs)
-    share, exposure = shares[RGB], result.exposure
-    picture, trust = trust_renders(fused, lrhs, tile.hrls[RGB], share=share, exposure=exposure, reach=reach)
+    picture, trust = trust_renders(
+        fused, lrhs, hrls, share=share, exposure=result.exposure, reach=reach, correct_light=tile.variance is None
+    )
     if borrowed is not None:  # there, the renders are not independent
         trust[borrowed] = 0
         picture = np.where(repeated(borrowed[..., None], scale), fused, picture)

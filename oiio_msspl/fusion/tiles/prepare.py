@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, VARIANCE
 from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
@@ -27,6 +27,10 @@ from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.model.contract import ONE_SIZE, Contract
 from oiio_msspl.model.encoding import find_exposure
 from oiio_msspl.model.render_mean import Images, Shares, find_shares
+
+#: The variance of the only render is believed if this share of the pixels has more than so much of its squared light.
+#: Single samples have none, but for rounding.
+KNOWN, ROUNDING = 1e-4, 1e-6
 
 
 @dataclass
@@ -47,6 +51,8 @@ class PreparedTile:
     """The renders agree, so the HRLS is the result."""
     aovs: tuple[str, ...] = ()
     """AOVs of the HRLS whose denoised pixels are kept."""
+    variance: Array | None = None
+    """Of the only render, (h, w, 3); None if it has none, or if there are two renders, which tell it."""
 
 
 class FramePair:
@@ -78,6 +84,7 @@ class FramePair:
         self._lr, self._hr, self._alignment, self._contract = lr, hr, alignment, contract
         self._aovs, self._share, self._on_read = aovs, share, on_read
         self._is_one_render = lr is hr
+        self._reads_variance = lr is hr and of_pass is None
         self.grid = aligned_grid(alignment.grid, contract.alignment)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         #: Features of a full-size LRHS are read tile by tile, to save memory. One render has all but alpha in the HRLS.
@@ -91,6 +98,25 @@ class FramePair:
         self._empty_regions = EmptyRegions(self._lrhs[RGB], reach, of_pass=of_pass is not None)
         self._part = self._lit_part(reach) if of_pass else None
 
+    @property
+    def tells_noise(self) -> bool:
+        """Whether two renders tell the noise of a pixel by their difference, or one by its variance.
+
+        A variance of luminance tells nothing of colours, and one that is 0 everywhere is that of single samples.
+
+        Raises:
+            InputError: pixels can't be decoded.
+        """
+        if not self._is_one_render:
+            return True
+        shares = []
+        for band in sample_bands(self._alignment.grid, ONE_SIZE) if self._reads_variance else []:
+            render = self._read(Tile(band, band), [RGB, VARIANCE]).hrls
+            if VARIANCE in render and render[VARIANCE].shape[-1] == 3:
+                least = np.float32(ROUNDING) * np.square(render[RGB]).max(axis=-1, keepdims=True)
+                shares.append(float((render[VARIANCE] > least).mean()))
+        return bool(shares) and float(np.mean(shares)) > KNOWN
+
     def counts(self, kind: str) -> dict[str, int]:
         """Return the numbers of values that were ``repaired`` or ``negative``, by render and feature (``lrhs.rgb``)."""
         renders = (("lrhs", self._lrhs_counts), ("hrls", self._hrls_counts))
@@ -102,12 +128,15 @@ class FramePair:
 
     def prepare(self, tile: Tile) -> PreparedTile:
         """Read a tile and apply the guards."""
-        features = self._read(tile, [*self._contract.hrls, "alpha"], self._hrls_counts)
+        variance = [VARIANCE] if self._reads_variance else []
+        features = self._read(tile, [*self._contract.hrls, "alpha", *variance], self._hrls_counts)
         self._on_read(features)
         empty = self._empty_regions.mask(features, tile.area.slices(self.grid))
         guides = {name: values for name, values in features.hrls.items() if name in (ALBEDO, NORMAL, "alpha")}
         aovs = tuple(name for name in self._aovs if name in features.hrls)
         prepared = PreparedTile(replace(features, hrls=guides), empty, aovs=aovs)
+        if self._reads_variance:
+            prepared.variance = features.hrls.get(VARIANCE)
         # An empty tile may still show surfaces.
         if empty is None or not empty.all() or self._aovs:
             lrhs_rgb, prepared.hrls = dim_fireflies(features)

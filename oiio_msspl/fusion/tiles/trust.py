@@ -50,8 +50,21 @@ LIGHT_REACH, LARGEST_FACTOR, CELL = 3, 2.0, 4
 LAMP = 1.0
 
 
+def halves_of(render: Array, variance: Array) -> tuple[Array, Array]:
+    """Return two pictures whose mean is a render, and which differ by twice the standard deviation of each pixel.
+
+    So would two renders of half of its samples, on average.
+
+    Args:
+        render: (h, w, 3), scene linear, >= 0.
+        variance: of the pixels' means, (h, w, 3).
+    """
+    deviation = np.sqrt(variance)
+    return render + deviation, render - deviation
+
+
 def trust_renders(
-    fused: Array, lrhs: Array, hrls: Array, *, share: float, exposure: float, reach: int
+    fused: Array, lrhs: Array, hrls: Array, *, share: float, exposure: float, reach: int, correct_light: bool = True
 ) -> tuple[Array, Array]:
     """Put back detail and light that both renders show.
 
@@ -63,6 +76,7 @@ def trust_renders(
         share: of the LRHS in the mean of both renders that has the least noise.
         exposure: factor that brings the scene to a log-mean luminance of mid-grey.
         reach: the largest distance, in LRHS pixels, over which a pixel may depend on others.
+        correct_light: False for the halves of one render, which say nothing of the light around a rare sample.
 
     Returns:
         The picture (s*h, s*w, c), >= 0, and how much of the HRLS's difference was put back, (h, w) in [0, 1].
@@ -74,11 +88,13 @@ def trust_renders(
         _exposed(planes_of(box_downsample(image, factor)), exposure)
         for image, factor in ((lrhs, 1), (hrls, scale), (fused, scale))
     )
-    light = list(zip(own, low, high, strict=True))
-    factors = two_at_a_time(lambda planes: _light_factor(*planes, share, scale, reach), light)
-    own = own * np.stack(factors)
-    scaled = zip(planes_of(fused), factors, strict=True)
-    picture = np.stack([plane * upsample_linear(factor, scale) for plane, factor in scaled])
+    picture = planes_of(fused).copy()
+    if correct_light:
+        light = list(zip(own, low, high, strict=True))
+        factors = two_at_a_time(lambda planes: _light_factor(*planes, share, scale, reach), light)
+        own *= np.stack(factors)
+        for plane, factor in zip(picture, factors, strict=True):
+            plane *= upsample_linear(factor, scale)
     # For d = LRHS - mean of the HRLS, E d^2 share s^2 is the variance of an HRLS pixel. At scale 1, the variance of
     # the mean of both renders is E d^2 share (1 - share). Both renders are rounded to half floats.
     variance = np.float32(share * (scale**2 if scale > 1 else 1 - share))

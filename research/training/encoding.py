@@ -15,12 +15,11 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import LUMINANCE_WEIGHTS
-from oiio_msspl.model.encoding import BLOCK, KEY, MAX_ALBEDO, MAX_RADIANCE, MIN_BLOCKS, MU, NO_LIGHT, NOISY, SATURATED
+from oiio_msspl.model.encoding import MAX_ALBEDO, MAX_RADIANCE, MU, find_exposure
 
 #: Factor of the logarithm, which makes a log-encoded radiance of 1 a 1.
 LOG_SCALE = 1.0 / math.log1p(MU)
@@ -105,28 +104,8 @@ def repair(values: Tensor, *, signed: bool = False) -> Tensor:
 
 
 def exposure_of(lrhs: Tensor) -> Tensor:
-    """Return the exposure (N,) of each image (N, h, w, 3), as :func:`oiio_msspl.model.encoding.find_exposure`."""
-    y = torch.maximum(luminance(lrhs), float(SATURATED) * lrhs.amax(dim=-1))
-    lit = torch.where(y > 0, y, torch.nan).flatten(1)
-    bright = lit.nanquantile(0.99, dim=1, keepdim=True)
-    exposure = KEY / _log_mean(lit, NO_LIGHT * bright)
-    rows, columns = (side // BLOCK for side in y.shape[1:])
-    if rows * columns >= MIN_BLOCKS:
-        shares = torch.minimum(y, bright[..., None]) / bright[..., None]
-        light, squares = (F.avg_pool2d(values, BLOCK).flatten(1) for values in (shares, shares * shares))
-        levels = torch.where(squares > 0, squares / light, torch.nan)
-        levels = torch.where(levels >= NO_LIGHT, levels, torch.nan)
-        mean = _log_mean(levels, torch.zeros_like(bright))
-        most = NOISY / (torch.minimum(levels.nanquantile(0.5, dim=1), mean) * bright[:, 0])
-        exposure = torch.fmin(exposure, most)  # where no block is lit, it is NaN
-    return torch.nan_to_num(exposure, nan=1.0)
-
-
-def _log_mean(lit: Tensor, darkest: Tensor) -> Tensor:
-    """Return the log-mean (N,) of the luminances (N, n) that are neither below ``darkest`` (N, 1) nor NaN."""
-    lit = torch.where(lit >= darkest, lit, torch.nan)
-    offset = 1e-4 * lit.nanmedian(dim=1, keepdim=True).values
-    return torch.exp(torch.log(lit + offset).nanmean(dim=1))
+    """Return the exposure (N,) of each image (N, h, w, 3)."""
+    return lrhs.new_tensor([find_exposure(image.cpu().numpy()) for image in lrhs])
 
 
 def compress(radiance: Tensor, exposure: Tensor) -> Tensor:

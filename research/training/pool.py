@@ -36,10 +36,9 @@ from torch import Tensor, nn
 from research.datagen.views import NO_REFERENCE, Folder, SampleView, View
 from research.training import checkpoints
 from research.training.data import Batch, SampleTensors, Sampling, ViewTensors, draw, turned
-from research.training.denoisers import LayerDenoisers, denoise_mean
-from research.training.encoding import compress, exposure_of, log_decode, log_encode, log_to_pu, pu_to_log
+from research.training.denoisers import FullSizeDenoiser, LayerDenoisers, denoise_mean
+from research.training.encoding import compress, exposure_of, log_decode, log_encode
 from research.training.joint import HRLS_CHANNELS, JointFusion
-from research.training.oidn import LARGE, LARGE_HDR, FineTunedUNet
 from research.training.render_mean import with_mean
 
 log = logging.getLogger(__name__)
@@ -85,25 +84,20 @@ class Denoisers:
         return self.moved(LayerDenoisers())
 
     @functools.cached_property
-    def large(self) -> FineTunedUNet:
+    def large(self) -> FullSizeDenoiser:
         """OIDN's large network."""
-        return self.moved(FineTunedUNet(LARGE_HDR, LARGE))
+        return self.moved(FullSizeDenoiser())
 
     def moved(self, network: M) -> M:
         """Return a network without gradients, on the device."""
         moved: M = network.requires_grad_(False).to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return moved
 
-    def denoised(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-        """Denoise a log-encoded colour with an albedo and a normal in [0, 1] that are free of noise."""
-        output = self.large.run(torch.cat([log_to_pu(colour), albedo, normal], dim=1))
-        return pu_to_log(output.float().clamp(0, 1))
-
     def reference(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
         """Return the mean of a rendered reference and of a denoised one, all (1, 3, H, W)."""
         exposure = exposure_of(colour.movedim(1, -1))
         encoded = compress(colour.movedim(1, -1), exposure).movedim(-1, 1)
-        return 0.5 * (colour + log_decode(self.denoised(encoded, *self.layers(albedo, normal))) / exposure)
+        return 0.5 * (colour + log_decode(self.large(encoded, *self.layers(albedo, normal))) / exposure)
 
     def prepared(self, lrhs: Tensor, hrls: Tensor, spread: bool) -> tuple[Tensor, Tensor]:
         """Convert the arguments of :meth:`JointFusion.forward` to those of :meth:`JointFusion.fuse_prepared`."""
@@ -140,7 +134,7 @@ class Teacher:
         first, _ = self.larges[spread].fuse_prepared(lrhs, prepared)
         results = [joint, first, first]
         if not spread:
-            results.append(self.denoisers.denoised(prepared[:, :3], prepared[:, 3:6], 0.5 * prepared[:, 6:9] + 0.5))
+            results.append(self.denoisers.large(prepared[:, :3], prepared[:, 3:6], 0.5 * prepared[:, 6:9] + 0.5))
         return log_encode(torch.stack([log_decode(result) for result in results]).mean(dim=0))
 
 

@@ -133,7 +133,7 @@ def test_a_teacher_averages_radiance(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(JointFusion, "fuse", lambda *_: (grey(1.0), None))
     monkeypatch.setattr(JointFusion, "fuse_prepared", lambda *_: (grey(4.0), None))
-    monkeypatch.setattr(Denoisers, "denoised", lambda *_: grey(7.0))
+    monkeypatch.setattr(Denoisers, "large", lambda *_: grey(7.0))
     unread = torch.zeros(1, 9, 4, 4)
     for spread, mean in ((False, 4.0), (True, 3.0)):
         torch.testing.assert_close(teacher.target(unread, unread, unread, spread), grey(mean))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training views: two generators of random scenes, and the file format that both write.
+"""Views for training and tests: two generators of random scenes, and the file format that both write.
 
 ``views`` is the file format. ``quality`` rejects useless cameras and estimates the noise of a reference.
 ``command_line`` is the command line of a generator. ``meshes`` and ``textures`` are procedural content for both.

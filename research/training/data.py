@@ -135,22 +135,18 @@ class ViewTensors:
     def __init__(self, view: View, device: torch.device) -> None:
         self.device, self.lr_spp = device, view.lr_spp
         self.hr, self.ref = (torch.from_numpy(array).to(device) for array in (view.hr, view.ref))
-        self.lr = {scale: torch.from_numpy(passes).to(device) for scale, passes in view.lr.items()}
+        self.lr = torch.from_numpy(view.lr[1]).to(device)
         self.size: tuple[int, int] = view.ref.shape[:2]
         """Height and width in HRLS pixels."""
 
     def lrhs(self, passes: np.ndarray, scale: int, *, nearest: bool) -> Tensor:
         """Average passes, as :func:`research.datagen.views.mean_lrhs`: (H/s, W/s, 3).
 
-        ``nearest`` takes one pixel of s x s instead of their mean, as the paper does. It has no effect on passes that
-        were rendered at 1/s of the resolution.
+        ``nearest`` takes one pixel of s x s instead of their mean, as the paper does.
         """
-        stored = self.lr[scale if scale in self.lr else 1]
         weights = torch.from_numpy((self.lr_spp[passes] / self.lr_spp[passes].sum()).astype(np.float32))
-        images = repair(torch.stack([stored[p] for p in passes]))
-        mean = torch.einsum("p,phwc->hwc", weights.to(stored.device), images)
-        if scale in self.lr:
-            return mean
+        images = repair(torch.stack([self.lr[p] for p in passes]))
+        mean = torch.einsum("p,phwc->hwc", weights.to(self.device), images)
         if nearest:
             return mean[scale // 2 :: scale, scale // 2 :: scale]
         return box_downsample(mean.permute(2, 0, 1)[None], scale)[0].permute(1, 2, 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line: ``python -m research.datagen.cycles --out VIEWS --seeds 0:400``."""
+"""The command line: ``python -m research.datagen.cycles --out VIEWS --seeds 1:262:20 --views 1``."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from research.datagen import command_line, views
 
 
 def main() -> int:
-    parser = command_line.parser("research.datagen.cycles", "Render training views with Blender's Cycles.", ref_spp=32)
-    text = "pixel filter of both renders; without it, the LRHS has a box filter and every fourth HRLS a wider one"
-    parser.add_argument("--filter", choices=views.FILTERS, help=text)
+    parser = command_line.parser("research.datagen.cycles", "Render test views with Blender's Cycles.", ref_spp=32)
     args = parser.parse_args()
+    if any(views.split_of(seed) != "test" for seed in args.seeds):
+        parser.error("--seeds: Cycles renders test scenes, whose seeds are 1, 21, 41 and so on, such as 1:262:20")
     from .render import render_scene
 
     # Blender prints a line for every file that it saves or imports. Python keeps the terminal, Blender gets /dev/null.
@@ -24,7 +24,7 @@ def main() -> int:
         os.dup2(nowhere.fileno(), 1)
 
     return command_line.render_all(
-        args, lambda seed: render_scene(args.out, seed, args.views, args.ref_spp, args.threads, args.filter)
+        args, lambda seed: render_scene(args.out, seed, args.views, args.ref_spp, args.threads)
     )
 
 

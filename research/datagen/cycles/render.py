@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Views of a scene as training files: choose cameras, render, write."""
+"""Views of a scene as files: choose cameras, render, write."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from research.datagen import quality, views
 from . import scenes
 
 _ATTEMPTS = 12  # cameras that are tried for a view
-# By split: samples are added until a reference reaches the first PSNR [dB], up to the third figure times `ref_spp`. A
-# reference below the second PSNR is not used. Training references may be noisy: their noise has zero mean, and many
-# scenes help more than clean ones. Validation and test references must be clean.
-_REFERENCE = {"train": (24.0, 20.0, 2), "validation": (28.0, 20.0, 4), "test": (40.0, 30.0, 12)}
+# dB: samples are added until a reference reaches the first PSNR. One below the second is not used.
+_GOOD_REFERENCE, _WORST_REFERENCE = 40.0, 30.0
+_STEPS = 12  # times that `ref_spp` samples are added, at most
+_FILTER = "BLACKMAN_HARRIS"  # Cycles' default
 LIGHT_PASSES = [f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color")]
 
 
@@ -80,7 +80,7 @@ class Renderer:
             setattr(layer, f"use_pass_{name}", on)
         layer.cycles.denoising_store_passes = on
 
-    def render(self, size: int, spp: int, seed: int, pixel_filter: str = "BOX") -> dict[str, np.ndarray]:
+    def render(self, size: int, spp: int, seed: int, pixel_filter: str = _FILTER) -> dict[str, np.ndarray]:
         """Render; return AOVs (size, size, C) by Blender's names, scene-linear and finite."""
         c = self._scene.cycles
         c.samples, c.seed = spp, seed
@@ -115,46 +115,35 @@ def find_cameras(renderer: Renderer, stage: scenes.Stage, seed: int, view: int) 
         rng = np.random.default_rng([seed, view, attempt, scenes.VERSION])
         camera = scenes.aim(stage, rng)
         renderer.layers(True)
-        probe = renderer.render(32, 16, int(rng.integers(2**31)))
+        probe = renderer.render(32, 16, int(rng.integers(2**31)), "BOX")
         depth = probe["Denoising Depth"]
         near = np.percentile(np.where(depth > 0, depth, 1e3), 10)  # metres; 0: background
         if (near > 0.15 or stage.hazy) and quality.shows_something(features(probe)):
             yield camera
 
 
-def _reference(
-    renderer: Renderer, rng: np.random.Generator, spp: int, pixel_filter: str, good: float, worst: float, steps: int
-) -> tuple[np.ndarray, int, float] | None:
-    """Render a reference: `spp` samples a pixel at a time, at most `steps` times, until its PSNR is `good`.
+def _reference(renderer: Renderer, rng: np.random.Generator, spp: int) -> tuple[np.ndarray, int, float] | None:
+    """Render a reference, `spp` samples a pixel at a time.
 
     Returns:
-        The image (H, W, 3), its spp and its estimated sRGB PSNR; None if that is below `worst`.
+        The image (H, W, 3), its spp and its estimated sRGB PSNR; None if it stays too noisy.
     """
     halves, done = np.zeros((2, views.SIZE, views.SIZE, 3)), 0
     while True:
         for half in range(2):
-            layers = renderer.render(views.SIZE, spp // 2, int(rng.integers(2**31)), pixel_filter)
+            layers = renderer.render(views.SIZE, spp // 2, int(rng.integers(2**31)))
             halves[half] += spp / 2 * _color(layers)
         done += spp
         psnr = quality.psnr_of_mean(*halves * (2 / done))
-        if psnr > good or done >= steps * spp:
-            return (halves.sum(0) / done, done, psnr) if psnr > worst else None
+        if psnr > _GOOD_REFERENCE or done >= _STEPS * spp:
+            return (halves.sum(0) / done, done, psnr) if psnr > _WORST_REFERENCE else None
 
 
 def render_view(
-    renderer: Renderer, stage: scenes.Stage, camera: dict[str, object],
-    seed: int, view: int, ref_spp: int, filter_name: str | None,
-) -> dict[str, np.ndarray] | None:  # fmt: skip
+    renderer: Renderer, stage: scenes.Stage, camera: dict[str, object], seed: int, view: int, ref_spp: int
+) -> dict[str, np.ndarray] | None:
     """Render all arrays of one view, see :mod:`research.datagen.views`; None if the reference stays too noisy."""
     rng = np.random.default_rng([seed, view, 7])
-    pixel_filter = "BLACKMAN_HARRIS" if seed % 4 == 3 else "BOX"
-    lr_filter = "BOX"
-    if filter_name is not None:
-        pixel_filter = lr_filter = filter_name.upper().replace("-", "_")
-    # Box-filtered passes at full resolution give the LRHS of every scale. A wider filter needs a render per scale.
-    scales = (1,) if lr_filter == "BOX" else SCALES
-
-    good, worst, steps = _REFERENCE[views.split_of(seed)]
 
     def some_seed() -> int:
         return int(rng.integers(2**31))
@@ -162,44 +151,32 @@ def render_view(
     renderer.layers(False)
 
     def lrhs(scale: int, spp: int) -> np.ndarray:
-        return _color(renderer.render(views.SIZE // scale, scale**2 * spp, some_seed(), lr_filter))
+        return _color(renderer.render(views.SIZE // scale, scale**2 * spp, some_seed()))
 
-    lr = {scale: np.stack([lrhs(scale, spp) for spp in views.LR_SPP]) for scale in scales}
+    lr = {scale: np.stack([lrhs(scale, spp) for spp in views.LR_SPP]) for scale in SCALES}
     # The noise of the LR passes tells whether the reference can become clean enough.
-    passes = lr[scales[0]]
+    passes = lr[SCALES[0]]
     first = np.average(passes[:-1], axis=0, weights=views.LR_SPP[:-1])
-    samples = scales[0] ** 2 * sum(views.LR_SPP)
-    if quality.psnr_of_mean(first, passes[-1]) + 10 * np.log10(steps * ref_spp / samples) < worst:
+    samples = SCALES[0] ** 2 * sum(views.LR_SPP)
+    if quality.psnr_of_mean(first, passes[-1]) + 10 * np.log10(_STEPS * ref_spp / samples) < _WORST_REFERENCE:
         return None
-    reference = _reference(renderer, rng, ref_spp, pixel_filter, good, worst, steps)
+    reference = _reference(renderer, rng, ref_spp)
     if reference is None:
         return None
     ref, spent, psnr = reference
     renderer.layers(True)
-    hr = np.stack([features(renderer.render(views.SIZE, 1, some_seed(), pixel_filter)) for _ in range(views.HR_PASSES)])
+    hr = np.stack([features(renderer.render(views.SIZE, 1, some_seed())) for _ in range(views.HR_PASSES)])
     meta = {
         "seed": f"cycles-{seed}", "view": view, "split": views.split_of(seed), "generator": scenes.VERSION,
         "kind": stage.kind, "renderer": f"Blender {bpy.app.version_string} Cycles", **renderer.settings,
-        "filter": _name_of(pixel_filter), "lr_filter": _name_of(lr_filter), "ref_spp": spent, "ref_psnr": psnr,
+        "filter": "blackman-harris", "lr_filter": "blackman-harris", "ref_spp": spent, "ref_psnr": psnr,
         "camera": camera,
     }  # fmt: skip
     return views.pack(hr, lr, ref, rng, meta)
 
 
-def _name_of(pixel_filter: str) -> str:
-    """Return one of `views.FILTERS` by its name in Blender."""
-    return pixel_filter.lower().replace("_", "-")
-
-
-def render_scene(
-    out: Path, seed: int, count: int, ref_spp: int, threads: int, filter_name: str | None
-) -> tuple[int, str]:
-    """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene.
-
-    Args:
-        filter_name: pixel filter of both renders. If None, the LRHS has a box filter, and the HRLS of every fourth
-            seed a wider one.
-    """
+def render_scene(out: Path, seed: int, count: int, ref_spp: int, threads: int) -> tuple[int, str]:
+    """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene."""
     missing = views.missing(out, "cycles", seed, count)
     if not missing:
         return 0, "done before"
@@ -210,6 +187,6 @@ def render_scene(
 
         def renders(view: int) -> Iterator[dict[str, np.ndarray] | None]:
             for camera in find_cameras(renderer, stage, seed, view):
-                yield render_view(renderer, stage, camera, seed, view, ref_spp, filter_name)
+                yield render_view(renderer, stage, camera, seed, view, ref_spp)
 
         return views.write(missing, renders), stage.kind

@@ -13,18 +13,18 @@ from __future__ import annotations
 
 import argparse
 import gc
-import itertools
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import torch
 
-from oiio_msspl.image.arrays import Array
 from research.benchmarks.render.film import write_exr
+from research.benchmarks.render.pairs import launched
 from research.benchmarks.render.sequences import CHANNELS
 from research.datagen.mitsuba import start as start_mitsuba
+from research.training.splat import BOX, PixelFilter, apply
 
 #: The first seed.
 FIRST = 9000
@@ -35,37 +35,13 @@ HRLS = (1, 8)
 LRHS = ((2, 1), (4, 1), (4, 4), (8, 1))
 #: Samples that are rendered at once.
 LAUNCH = 1_000_000
-#: Standard deviation and radius of the Gaussian filter in pixels: Mitsuba's default.
-DEVIATION, RADIUS = 0.5, 2.0
+LAYERS = ("color", "albedo", "normal")
+#: The second one is Mitsuba's default.
+FILTERS = BOX, PixelFilter("gaussian", 2.0)
 
 
-def splat(values: Array, place: Array) -> tuple[Array, Array]:
-    """Spread samples (n, h, w, c) over the pixels around them, by a Gaussian filter of their places (n, h, w, 2).
-
-    Returns:
-        The weighted sums (h, w, c), and the sums of the weights (h, w, 1).
-    """
-    reach = int(RADIUS)
-    height, width = values.shape[1:3]
-    sums = np.zeros((height + 2 * reach, width + 2 * reach, values.shape[3] + 1), np.float32)
-    values = np.concatenate([values, np.ones_like(values[..., :1])], axis=-1)
-    outermost = np.exp(-(RADIUS**2) / (2 * DEVIATION**2))
-    weights = {}
-    for step in range(-reach, reach + 1):
-        distance = step + np.float32(0.5) - place  # to the centre of the pixel that is this many pixels further
-        weights[step] = np.maximum(np.exp(-np.square(distance) / (2 * DEVIATION**2)) - outermost, 0)
-    for y, x in itertools.product(weights, repeat=2):
-        weight = weights[x][..., 0] * weights[y][..., 1]
-        spread = np.einsum("nhwc,nhw->hwc", values, weight)
-        sums[reach + y : reach + y + height, reach + x : reach + x + width] += spread
-    sums = sums[reach:-reach, reach:-reach]
-    return sums[..., :-1], sums[..., -1:]
-
-
-def render(scene: Any, camera: Any, folder: Path, size: tuple[int, int], gaussian: bool) -> None:
+def render(scene: Any, camera: Any, folder: Path, size: tuple[int, int], pixel_filter: PixelFilter) -> None:
     """Render the files of one camera that do not exist yet."""
-    from research.datagen.mitsuba.trace import render_samples
-
     aspect = size[1] / size[0]  # the camera's own picture is square
     wide: Any = SimpleNamespace(rays=lambda x, y, lens: camera.rays(x, (y - 0.5) * aspect + 0.5, lens))
     jobs = [(f"hr_{spp}spp", 1, spp) for spp in HRLS]
@@ -74,18 +50,12 @@ def render(scene: Any, camera: Any, folder: Path, size: tuple[int, int], gaussia
         path = folder / f"{name}.exr"
         if path.exists():
             continue
-        width, height = (n // scale for n in size)
-        per_launch = max(1, LAUNCH // (width * height))
-        total, weights = np.zeros((height, width, 9), np.float32), np.zeros((height, width, 1), np.float32)
-        for done in range(0, spp, per_launch):
-            count = min(per_launch, spp - done)
-            seed = zlib.crc32(f"{folder.name} {name} {done}".encode())
-            samples = render_samples(scene, wide, (width, height), count, seed)
-            values = np.concatenate([samples[layer] for layer in ("color", "albedo", "normal")], axis=-1)
-            sums = splat(values, samples["place"]) if gaussian else (values.sum(axis=0), np.float32(count))
-            total, weights = total + sums[0], weights + sums[1]
+        low = (size[0] // scale, size[1] // scale)
+        launches = list(launched(scene, wide, low, spp, f"{folder.name} {name}", LAYERS, LAUNCH))
+        layers = {layer: torch.from_numpy(np.concatenate([x[layer] for x in launches])) for layer in launches[0]}
+        values = torch.cat([layers[layer].movedim(-1, 1) for layer in LAYERS], dim=1)
         folder.mkdir(parents=True, exist_ok=True)
-        write_exr(path, total / np.maximum(weights, 1e-6), CHANNELS)
+        write_exr(path, apply(pixel_filter, layers["place"], values).movedim(0, -1).numpy(), CHANNELS)
 
 
 def main() -> None:
@@ -108,7 +78,7 @@ def main() -> None:
         for view, (suffix, size) in enumerate(SIZES.items()):
             camera = next(find_cameras(scene, plan, seed, view), None)
             if camera is not None:
-                render(scene, camera, args.out / f"{plan.kind}-{seed}{suffix}", size, seed % 2 == 1)
+                render(scene, camera, args.out / f"{plan.kind}-{seed}{suffix}", size, FILTERS[seed % 2])
         gc.collect()  # scenes are reference cycles, which only the collector frees
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from numpy.typing import NDArray
 from oiio_msspl.model.contract import SCALES
 from research.benchmarks.render.film import CROP, frame_size, set_crop, write_exr
 from research.datagen.mitsuba import start as start_mitsuba
-from research.datagen.views import FILTERS
 
 HRLS = (1, 2, 3, 4, 6, 7, 8)
 #: Samples of the LRHS for every HRLS pixel.
@@ -82,23 +82,35 @@ def mean_of_samples(
         placing: pixel filter of :mod:`research.datagen.mitsuba.trace`.
     """
     from research.datagen.mitsuba.trace import LAYERS as SAMPLED
-    from research.datagen.mitsuba.trace import render_samples
 
-    per_launch = max(1, LAUNCH // (size[0] * size[1]))
     names = SAMPLED[:5] if layers else SAMPLED[:1]
     total = np.zeros((size[1], size[0], 3 * len(names)))
-    for done in range(0, spp, per_launch):
-        count, seed = min(per_launch, spp - done), zlib.crc32(f"{title} {done}".encode())
-        samples = render_samples(scene, camera, size, count, seed, names, pixel_filter=placing)  # type: ignore[arg-type]
+    for samples in launched(scene, camera, size, spp, title, names, LAUNCH, pixel_filter=placing):
         total += np.concatenate([samples[name] for name in names], axis=-1).sum(axis=0, dtype=np.float64)
     return total / spp
+
+
+def launched(
+    scene: Any, camera: Any, size: tuple[int, int], spp: int, title: str, layers: tuple[str, ...], most: int,
+    **options: Any,
+) -> Iterator[dict[str, NDArray[Any]]]:  # fmt: skip
+    """Yield the samples of :func:`research.datagen.mitsuba.trace.render_samples`, in launches of ``most`` at most.
+
+    The random numbers follow from the title.
+    """
+    from research.datagen.mitsuba.trace import render_samples
+
+    per_launch = max(1, most // (size[0] * size[1]))
+    for done in range(0, spp, per_launch):
+        count, seed = min(per_launch, spp - done), zlib.crc32(f"{title} {done}".encode())
+        yield render_samples(scene, camera, size, count, seed, layers, **options)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--filter", choices=FILTERS, default="blackman-harris")
+    parser.add_argument("--filter", choices=("box", "blackman-harris"), default="blackman-harris")
     parser.add_argument("--reference", type=int, default=2048, help="spp")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
+import OpenEXR
 from numpy.typing import NDArray
 
-from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
 
 #: Longer side of the whole frame, and width and height of the crop that is rendered, in pixels.
@@ -32,21 +31,11 @@ def set_crop(mi: Any, parameters: Any, frame: Any, crop: Any, offset: Any) -> No
     parameters.update()
 
 
-def write_exr(path: Path, image: NDArray[Any], channels: Sequence[str], pixel_type: str = "half") -> None:
-    """Write (h, w, c) as half or float; the channels get the first c names.
-
-    Raises:
-        MssplError: the file can't be written.
-    """
-    height, width, count = image.shape
-    spec = oiio.ImageSpec(width, height, count, pixel_type)
-    spec.channelnames = tuple(channels[:count])
-    spec.attribute("compression", "zip")
-    spec.attribute("Software", "Mitsuba 3")
-    largest = 65000 if pixel_type == "half" else np.inf
-    with replacing(path, overwrite=True) as temporary:
-        writer: Any = oiio.ImageOutput.create(str(temporary))
-        ok = writer.open(str(temporary), spec)
-        ok = ok and writer.write_image(np.ascontiguousarray(np.clip(image, -largest, largest), dtype=np.float32))
-        if not (writer.close() and ok):
-            raise MssplError(f"{path}: can't be written ({writer.geterror()})")
+def write_exr(path: Path, image: NDArray[Any], channels: Sequence[str], pixel_type: type = np.float16) -> None:
+    """Write (h, w, c) as half or float; the channels get the first c names."""
+    largest = 65000 if pixel_type == np.float16 else np.inf
+    pixels: NDArray[Any] = image.astype(np.float32).clip(-largest, largest).astype(pixel_type)
+    planes = {name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(channels[: image.shape[2]])}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with replacing(path, overwrite=True) as temporary, OpenEXR.File(header, planes) as file:
+        file.write(str(temporary))

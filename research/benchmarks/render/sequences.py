@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from research.benchmarks.render import moving_scenes as rooms
-from research.benchmarks.render.film import set_crop, write_exr
+from research.benchmarks.render.film import frame_size, set_crop, write_exr
 from research.benchmarks.render.moving_scenes import ANIMATIONS, Room
 from research.datagen.mitsuba import start as start_mitsuba
 
@@ -98,9 +98,8 @@ class _FileScene:
     def __init__(self, mi: Any, file: Path, *, moving: bool) -> None:
         self._step = 1.0 if moving else 0.0
         self._room = Room(mi.load_file(str(file)))
+        self.size = frame_size(self._room.scene.sensors()[0], LONGER).tolist()
         sensor = mi.traverse(self._room.scene.sensors()[0])
-        width, height = sensor["film.size"]
-        self.size = [round(v * LONGER / max(width, height) / 8) * 8 for v in (width, height)]
         self.offset = [
             min(max(int((share * size - crop / 2) // 8 * 8), 0), size - crop)
             for share, size, crop in zip(SCENES[file.parent.name], self.size, (WIDTH, HEIGHT), strict=True)
@@ -197,7 +196,7 @@ def render_sequence(mi: Any, scene: Any, folder: Path, pixel_filter: str) -> Non
         room, camera = scene.room(frame, at), scene.camera(at)
         shown = surfaces(mi, room, camera)
         vectors = np.concatenate([motion(shown, scene, at, at + step) for step in (-1, 1)], axis=-1)
-        write_exr(paths["mask"], np.concatenate([shown, vectors], axis=-1), (*MASK, *MOTION), "float")
+        write_exr(paths["mask"], np.concatenate([shown, vectors], axis=-1), (*MASK, *MOTION), np.float32)
         for kind, scale, spp in wanted:
             if paths[kind].exists():
                 continue
@@ -205,7 +204,7 @@ def render_sequence(mi: Any, scene: Any, folder: Path, pixel_filter: str) -> Non
             tracer = integrator if kind.startswith("ref") else with_aovs
             image = _shoot(mi, room.scene, tracer, scene, camera, spp, scale, seed, pixel_filter)
             if kind == "hr":
-                write_exr(paths[kind], np.concatenate([image, vectors], axis=-1), (*CHANNELS, *MOTION), "float")
+                write_exr(paths[kind], np.concatenate([image, vectors], axis=-1), (*CHANNELS, *MOTION), np.float32)
             else:
                 write_exr(paths[kind], image[..., :9], CHANNELS)
 

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import box_downsample, enlarged
+from research.benchmarks.render.film import write_exr
 
 #: How many pixels the wall moves to the left from one frame to the next.
 STEP = 3
@@ -62,11 +62,5 @@ def write_shot(folder: Path, count: int, width: int, height: int, scale: int, la
 
 def write_layers(path: Path, layers: Mapping[str, tuple[Array, str]]) -> None:
     """Write layers (h, w, c), each with a letter for every channel, as half floats."""
-    channels = {
-        f"{layer}.{letter}".lstrip("."): np.ascontiguousarray(image[..., i], np.float16)
-        for layer, (image, letters) in layers.items()
-        for i, letter in enumerate(letters)
-    }
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, channels) as file:
-        file.write(str(path))
+    channels = [f"{layer}.{letter}".lstrip(".") for layer, (_, letters) in layers.items() for letter in letters]
+    write_exr(path, np.concatenate([image for image, _ in layers.values()], axis=-1), channels)

@@ -29,10 +29,10 @@ def test_vectors_lead_to_the_same_surface_in_the_next_frame():
 def test_a_shot_has_the_flicker_of_its_frames(tmp_path):
     truth = picture(32, 48)
     for number in (1, 2, 3):
-        write_exr(tmp_path / f"ref.{number:04}.exr", truth, RGB, "float")
+        write_exr(tmp_path / f"ref.{number:04}.exr", truth, RGB, np.float32)
         for name, image in (("steady", truth), ("noisy", noisy(truth, 8, number))):
             (tmp_path / name).mkdir(exist_ok=True)
-            write_exr(tmp_path / name / f"out.{number:04}.exr", image, RGB, "float")
+            write_exr(tmp_path / name / f"out.{number:04}.exr", image, RGB, np.float32)
     steady, rough = (outsiders._scores(tmp_path, tmp_path / name) for name in ("steady", "noisy"))
     assert steady["flicker"] == 0 and steady["relmse"] == 0 and steady["flip"] == pytest.approx(0, abs=1e-4)
     assert rough["flicker"] > 0.01 and rough["psnr"] < 40

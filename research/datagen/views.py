@@ -56,8 +56,6 @@ HR_PASSES, LR_SPP = 8, (1, 1, 2, 4, 8)
 SAMPLES_SUFFIX, REF_CELLS = ".samples.npz", 2
 #: Cameras with which a view is rendered, at most, until its reference is clean enough.
 RENDERS = 2
-#: Pixel filters that a view's ``meta`` may name.
-FILTERS = ("box", "blackman-harris")
 
 #: Features that a renderer writes, in the channel order of ``hr``. The variance is computed from the passes.
 PASS_FEATURES = tuple(name for name in HRLS_FEATURES if name != VARIANCE)
@@ -237,29 +235,23 @@ class SampleView(StoredView):
 
 
 class Folder:
-    """The views of a folder. :meth:`scan` finds those that a renderer has added since."""
+    """The views of a folder, sorted by file name. Hidden files are still being written."""
 
     def __init__(self, root: Path) -> None:
-        self.root = root
-        self._views: dict[Path, View | SampleView] = {}
-        self.scan()
-
-    def scan(self) -> None:
-        """Pick up new views. Hidden files are still being written. The next scan retries unreadable files."""
-        for path in sorted(self.root.glob("[!.]*.npz")):
-            if path not in self._views:
-                try:
-                    self._views[path] = (SampleView if path.name.endswith(SAMPLES_SUFFIX) else View)(path)
-                except (ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile) as error:
-                    log.warning("skipped %s: %s", path.name, error)
+        self._views: list[View | SampleView] = []
+        for path in sorted(root.glob("[!.]*.npz")):
+            try:
+                self._views.append((SampleView if path.name.endswith(SAMPLES_SUFFIX) else View)(path))
+            except (ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile) as error:
+                log.warning("skipped %s: %s", path.name, error)
 
     def split(self, name: str) -> list[View]:
-        """Return the views of one split, sorted by file name."""
-        return [v for _, v in sorted(self._views.items()) if isinstance(v, View) and v.split == name]
+        """Return the views of one split."""
+        return [view for view in self._views if isinstance(view, View) and view.split == name]
 
     def sample_views(self, split: str) -> list[SampleView]:
-        """Return the views of one split that keep single samples, sorted by file name."""
-        return [v for _, v in sorted(self._views.items()) if isinstance(v, SampleView) and v.split == split]
+        """Return the views of one split that keep single samples."""
+        return [view for view in self._views if isinstance(view, SampleView) and view.split == split]
 
 
 def split_features(passes: Array) -> dict[str, Array]:

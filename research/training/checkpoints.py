@@ -19,10 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from research.training.data import Prepare
 from research.training.joint import JointFusion
 from research.training.paper import MultiResolutionFusion
-from research.training.render_mean import with_mean
 
 State = dict[str, Any]
 Network = MultiResolutionFusion | JointFusion
@@ -33,11 +31,6 @@ log = logging.getLogger(__name__)
 RUN_STATE = ("network", "optimizer", "best_psnr")
 #: Parts of a parameter's name that older checkpoints have, and what they are called now.
 RENAMED = {"together.": "mean_denoiser.", ".more": ".extra"}
-
-
-def preparation(architecture: str) -> Prepare | None:
-    """Return the function that adds a network's further input channels to a pair; None if it has none."""
-    return with_mean if architecture == "joint" else None
 
 
 def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:

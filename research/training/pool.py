@@ -7,8 +7,8 @@
 
 A GPU takes a step in less time than :func:`research.training.data.draw` takes for one pair. So whole views are drawn
 ahead, some times each: with other samples, filters, light and missing layers at each draw. The pairs of a view lie in a
-file of POOL. The same command goes on with new views. Training keeps all pairs on the GPU, and looks for new ones. Each
-batch has crops of some of them, mirrored, turned, and with permuted colours.
+file of POOL. The same command goes on with new views. Training keeps all pairs on the GPU. Each batch has crops of some
+of them, mirrored, turned, and with permuted colours.
 
 With ``--denoise``, pairs are those that the size ``large`` of `joint` reads: albedo, normal and the mean of both
 renders are denoised. Of views with single samples, every second pair then has noise that the pixel filter has spread.
@@ -24,7 +24,6 @@ from __future__ import annotations
 import argparse
 import functools
 import logging
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -47,8 +46,6 @@ log = logging.getLogger(__name__)
 ALIGNMENT = 128
 #: Share of the pairs in which parts of both renders have more samples.
 UNEVEN = 0.3
-#: Seconds between two looks for new files.
-RESCAN_SECONDS = 5.0
 
 #: Entry of a pair: whether the pixel filter has spread its noise.
 SPREAD_NOISE = "spread"
@@ -212,39 +209,29 @@ class PooledBatches:
         self, pool: Path, scales: tuple[int, ...], patch: int, batch: int, seed: int, device: torch.device, *,
         spread: bool | None = None,
     ) -> None:  # fmt: skip
-        self.spread = spread
-        self.pool, self.scales, self.patch, self.batch, self.device = pool, scales, patch, batch, device
+        self.scales, self.patch, self.batch, self.device = scales, patch, batch, device
         self.rng = np.random.default_rng(seed)
         self.pairs: dict[int, list[Pair]] = {scale: [] for scale in scales}
-        self.loaded: set[Path] = set()
-
-    def load(self) -> None:
-        """Load the files that are new."""
-        for file in sorted(set(self.pool.glob("*.pt")) - self.loaded):
-            self.loaded.add(file)
+        for file in sorted(pool.glob("*.pt")):
             for pair in torch.load(file, weights_only=True):
-                spread = pair.pop(SPREAD_NOISE, None)
-                if self.spread is not None:
-                    if spread is None:
-                        raise SystemExit(f"{file}: does not tell spread noise apart; draw pairs with --denoise")
-                    if self.spread != bool(spread):
-                        continue
-                scale = pair["hrls"].shape[-1] // pair["lrhs"].shape[-1]
-                if scale in self.pairs and pair["hrls"].shape[-1] >= self.patch:
-                    self.pairs[scale].append({name: image.to(self.device) for name, image in pair.items()})
+                self._keep(pair, file, spread)
+        if not any(self.pairs.values()):
+            raise SystemExit(f"{pool}: holds no pairs for this training; draw some with research.training.pool")
+
+    def _keep(self, pair: Pair, file: Path, wanted: bool | None) -> None:
+        """Move a pair to the device, if it is of use."""
+        spread = pair.pop(SPREAD_NOISE, None)
+        if wanted is not None and spread is None:
+            raise SystemExit(f"{file}: does not tell spread noise apart; draw pairs with --denoise")
+        scale = pair["hrls"].shape[-1] // pair["lrhs"].shape[-1]
+        of_kind = wanted is None or wanted == bool(spread)
+        if of_kind and scale in self.pairs and pair["hrls"].shape[-1] >= self.patch:
+            self.pairs[scale].append({name: image.to(self.device) for name, image in pair.items()})
 
     def loader(self) -> Iterator[Batch]:
-        """Yield endless batches, see :data:`research.training.data.Batch`. Wait until the pool has a pair."""
-        looked = -RESCAN_SECONDS
+        """Yield endless batches, see :data:`research.training.data.Batch`."""
+        ready = [scale for scale in self.scales if self.pairs[scale]]
         while True:
-            if time.monotonic() - looked > RESCAN_SECONDS:
-                self.load()
-                looked = time.monotonic()
-            ready = [scale for scale in self.scales if self.pairs[scale]]
-            if not ready:
-                time.sleep(0.2)
-                self.load()
-                continue
             yield self.draw(int(self.rng.choice(ready)))
 
     def draw(self, scale: int) -> Batch:

@@ -17,6 +17,7 @@ import csv
 import logging
 import math
 import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any, cast
@@ -29,11 +30,12 @@ from torch.optim.swa_utils import AveragedModel
 from oiio_msspl.exr.atomic import replacing
 from research.datagen.views import Folder, SampleView, View
 from research.training import checkpoints, losses
-from research.training.checkpoints import NETWORKS, Network, preparation, run
+from research.training.checkpoints import NETWORKS, Network, run
 from research.training.data import Batches, spp_range
 from research.training.joint import SIZES, JointFusion
 from research.training.paper import MultiResolutionFusion
 from research.training.pool import PooledBatches
+from research.training.render_mean import with_mean
 from research.training.validation import ValidationPair, evaluate
 
 log = logging.getLogger(__name__)
@@ -118,18 +120,17 @@ class Run:
         self.scales = tuple(args.scale)
         self.patch = args.patch or max(PATCH[scale] for scale in self.scales)
         self.peak_lr = args.lr
-        self.device = torch.device(
-            args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
-        )
+        self.device = torch.device(args.device)
         torch.backends.cudnn.benchmark = True  # batches of a scale have one size
         self.checkpoint_path, self.best_path = args.out / "checkpoint.pt", args.out / "best.pt"
         self.step, self.elapsed, self.best_psnr = 0, 0.0, -math.inf
 
         # Data
         self.folder = Folder(args.data)
-        if not self.train_views():
+        self.views: list[View | SampleView] = [*self.folder.split("train"), *self.folder.sample_views("train")]
+        if not self.views:
             raise SystemExit(f"{args.data}: no training views (*.npz with split 'train'); render some first")
-        self.validation: list[ValidationPair] = []
+        self.prepare = with_mean if args.network == "joint" else None
 
         # Network: from the last checkpoint, from another run, or new
         self.network = new_network(args)
@@ -139,6 +140,12 @@ class Run:
             raise SystemExit(
                 "--size large: needs a --pool of pairs that research.training.pool has drawn with --denoise"
             )
+        #: A network of the size large is not scored.
+        self.validation = [
+            ValidationPair.centre(view, scale, args.val_patch, self.prepare)
+            for view in ([] if self.large else self.folder.split("validation")[: args.val_views])
+            for scale in dict.fromkeys(self.scales)
+        ]
         state = checkpoints.read(self.checkpoint_path) if self.checkpoint_path.exists() else None
         if state is None and args.init:
             checkpoints.warm_start(self.network, args.init)
@@ -161,8 +168,7 @@ class Run:
         if self.args.pool:
             spread = None if self.args.noise is None else self.args.noise == "spread"
             return PooledBatches(self.args.pool, *sizes, seed, self.device, spread=spread)
-        prepare = preparation(self.args.network)
-        return Batches(self.args.data, *sizes, prepare, seed=seed, device=self.device)
+        return Batches(self.args.data, *sizes, self.prepare, seed=seed, device=self.device)
 
     def new_schedule(self) -> LambdaLR:
         """Set the learning rate by the clock, at every ``step()`` of the schedule."""
@@ -184,24 +190,18 @@ class Run:
 
     def train(self) -> None:
         """Train until the minutes are over or a signal comes."""
-        stop = False
-
-        def on_signal(*_: object) -> None:
-            nonlocal stop
-            stop = True
-
-        signal.signal(signal.SIGTERM, on_signal)
-        signal.signal(signal.SIGINT, on_signal)
-
+        stop = threading.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: stop.set())
         budget, started = self.args.minutes * 60, time.monotonic() - self.elapsed
         self.checkpoint()
         next_checkpoint = self.elapsed + self.args.checkpoint_seconds
         batches, usual = iter(self.pairs.loader()) if self.elapsed < budget else iter(()), math.inf
-        while not stop and self.elapsed < budget:
+        while not stop.is_set() and self.elapsed < budget:
             self.step += 1
             usual = self.take_step(batches, usual)
             self.elapsed = time.monotonic() - started
-            if stop or self.elapsed >= min(budget, next_checkpoint):
+            if stop.is_set() or self.elapsed >= min(budget, next_checkpoint):
                 self.checkpoint()
                 next_checkpoint = self.elapsed + self.args.checkpoint_seconds
             self.schedule.step()
@@ -253,48 +253,36 @@ class Run:
         self.reset_statistics()
 
     def evaluate(self) -> dict[str, float]:
-        """Score the averaged weights on the validation views of the run's start."""
-        if self.large:
-            return {}
-        if not self.validation:  # views that are added later would make scores incomparable
-            patch, prepare = self.args.val_patch, preparation(self.args.network)
-            for view in self.folder.split("validation")[: self.args.val_views]:
-                for scale in dict.fromkeys(self.scales):
-                    self.validation.append(ValidationPair.centre(view, scale, patch, prepare))
+        """Score the averaged weights on the validation views."""
         return evaluate(cast(Network, self.average.module), self.validation, self.device)
-
-    def train_views(self) -> list[View | SampleView]:
-        """Return the training views that there are so far, of both kinds."""
-        return [*self.folder.split("train"), *self.folder.sample_views("train")]
 
     def log_row(self, scores: dict[str, float]) -> None:
         """Append a line to ``log.csv``."""
-        self.folder.scan()
         since, interval = self.since, max(time.monotonic() - self.since["time"], 1e-9)
         row = {
             "step": self.step, "minutes": self.elapsed / 60, "loss": since["loss"] / max(since["steps"], 1),
             "lr": self.optimizer.param_groups[0]["lr"], "skipped_steps": since["skipped"],
             "samples_per_s": since["steps"] * self.args.batch / interval, "wait_share": since["waited"] / interval,
-            "train_views": len(self.train_views()), "val_pairs": len(self.validation), **scores,
+            "train_views": len(self.views), "val_pairs": len(self.validation), **scores,
         }  # fmt: skip
         log.info("%s", "  ".join(f"{k} {v:.4g}" for k, v in row.items()))
         write_row(self.args.out / "log.csv", row)
 
     def state(self, scores: dict[str, float]) -> checkpoints.State:
         """Return the checkpoint, see :mod:`research.training.checkpoints`."""
-        views = self.train_views()
         provenance = {
             "steps": self.step, "minutes": round(self.elapsed / 60, 1), "batch": self.args.batch, "patch": self.patch,
             "loss": self.args.loss, "seed": self.args.seed, **({"init": self.args.init.name} if self.args.init else {}),
-            "views": len(views), "scenes": len({view.scene for view in views}),
-            "sources": sorted({view.source for view in views}), "torch": str(torch.__version__),
+            "views": len(self.views), "scenes": len({view.scene for view in self.views}),
+            "sources": sorted({view.source for view in self.views}), "torch": str(torch.__version__),
             "validation": {"pairs": len(self.validation), "hrls_spp": 1} | scores,
         }  # fmt: skip
         return {
             "network": self.network.state_dict(), "ema": self.average.module.state_dict(),
             "optimizer": self.optimizer.state_dict(), "architecture": self.args.network, "config": self.network.config,
             "step": self.step, "seconds": self.elapsed, "best_psnr": self.best_psnr,
-            "training_spp": {str(scale): spp_range(views, scale) for scale in self.scales}, "provenance": provenance,
+            "training_spp": {str(scale): spp_range(self.views, scale) for scale in self.scales},
+            "provenance": provenance,
         }  # fmt: skip
 
 
@@ -342,7 +330,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--loss", choices=losses.LOSSES, default="relative", help="(default: %(default)s)")
     add("--precision", choices=("bf16", "fp32"), default="bf16", help="of convolutions (default: %(default)s)")
     add("--threads", type=int, default=1, help="CPU threads; no more than idle cores (default: %(default)s)")
-    add("--device", default="auto")
+    add("--device", default="cpu")
     add("--seed", type=int, default=0)
     add("--val-views", type=int, default=24, help="validation views, at most")
     add("--val-patch", type=int, default=128, help="width of the validation crops in HRLS pixels")

@@ -24,7 +24,7 @@ class ValidationPair:
     """The middle of a view with 1 spp in the HRLS and s^2 spp in the LRHS, the paper's (s^2 - 1)."""
 
     lrhs: Tensor
-    """(1, 3, h, w), encoded, and the channels that :func:`research.training.checkpoints.preparation` adds."""
+    """(1, 3, h, w), encoded, and the channels that ``prepare`` adds."""
     hrls: Tensor
     """(1, 16, s*h, s*w), encoded. One sample has no variance, so that is missing."""
     reference: Array

@@ -99,7 +99,6 @@ def test_pairs_for_the_large_size_are_denoised_before(sample_folder: Path) -> No
     torch.save(drawn, sample_folder / "wall.pt")
     for spread, count in ((None, 2), (True, 1), (False, 1)):
         batches = PooledBatches(sample_folder, (4,), 128, 1, 0, CPU, spread=spread)
-        batches.load()
         assert len(batches.pairs[4]) == count
     lrhs, hrls = next(batches.loader())["lrhs"], next(batches.loader())["hrls"]
     fused, _ = JointFusion(size="large")(lrhs, hrls)
@@ -162,7 +161,7 @@ def test_networks_in_the_wrong_order_are_refused() -> None:
 
 def test_pairs_that_do_not_tell_their_noise_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="draw pairs with --denoise"):
-        PooledBatches(write_pool(tmp_path, 2), (2,), 64, 1, 0, CPU, spread=True).load()
+        PooledBatches(write_pool(tmp_path, 2), (2,), 64, 1, 0, CPU, spread=True)
 
 
 def write_pool(folder: Path, scale: int) -> Path:
@@ -185,14 +184,3 @@ def test_crops_of_all_images_show_the_same_place(tmp_path: Path, scale: int) -> 
         small = torch.nn.functional.avg_pool2d(batch["target"], scale)
         for part in batch["lrhs"].split(3, dim=1)[:2]:
             torch.testing.assert_close(part, small, atol=2e-3, rtol=0)
-
-
-def test_a_pool_that_grows_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("research.training.pool.RESCAN_SECONDS", 0.0)
-    batches = PooledBatches(write_pool(tmp_path, 2), (2, 8), 64, 1, 0, CPU)
-    loader = batches.loader()
-    next(loader)
-    assert not batches.pairs[8]
-    write_pool(tmp_path, 8)
-    next(loader)
-    assert batches.pairs[8]

@@ -9,8 +9,6 @@ fine-tuned network reads all of these. Albedo and normal are denoised by Open Im
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
@@ -81,14 +79,10 @@ def denoise_mean(denoiser: MeanDenoiser, lrhs: Tensor, hrls: Tensor) -> Tensor:
     return torch.cat([lrhs[:, :LRHS_CHANNELS], denoiser(*mean_images(lrhs, hrls))], dim=1)
 
 
-def with_denoised_mean(denoiser: MeanDenoiser) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a function that appends the denoised mean of both renders to an encoded LRHS, given an HRLS."""
-
-    @torch.no_grad()
-    def prepare(lrhs: Tensor, hrls: Tensor) -> Tensor:
-        return denoise_mean(denoiser, with_mean(lrhs, hrls), hrls)
-
-    return prepare
+@torch.no_grad()
+def with_denoised_mean(denoiser: MeanDenoiser, lrhs: Tensor, hrls: Tensor) -> Tensor:
+    """Append the denoised mean of both renders to an encoded LRHS."""
+    return denoise_mean(denoiser, with_mean(lrhs, hrls), hrls)
 
 
 class LayerDenoisers(nn.Module):

@@ -9,6 +9,7 @@ Only the convolution that predicts the error is trained, for some hundred batche
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ def main() -> None:
     scales = [int(scale) for scale in state["training_spp"]]
     prepare: data.Prepare = with_mean
     if network.mean_denoiser is None:
-        prepare = with_denoised_mean(denoiser_for(network, network.denoiser(scales[0])))
+        prepare = partial(with_denoised_mean, denoiser_for(network, network.denoiser(scales[0])))
     loss = fit(network, args.data, scales, prepare, args.steps)
     # In the precision of the checkpoint: research.training.average stores half floats
     state["ema"] = {name: values.to(state["ema"][name].dtype) for name, values in network.state_dict().items()}

@@ -8,14 +8,13 @@ r"""Export a checkpoint's averaged weights as an ONNX file: a whole model with i
 
 ``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
 computation. ``--int8`` computes convolutions in 8 bits (:mod:`research.training.quantise`). Files of several scales
-share their weights, in ``NAME.weights``. ``-x2`` and so on are then added to ``--name``, and ``-x2.onnx`` to the
-output.
+have the same weights, which :mod:`research.training.share` then stores once. ``-x2`` and so on are added to ``--name``,
+and ``-x2.onnx`` to the output.
 """
 
 from __future__ import annotations
 
 import argparse
-import collections
 import copy
 import datetime
 from collections.abc import Sequence
@@ -25,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
@@ -43,7 +41,7 @@ from research.training.paper import MultiResolutionFusion
 from research.training.quantise import joint
 from research.training.quantise.layers import Networks, quantised, varied
 from research.training.tracing import IR_VERSION, network_example, prepend, traced
-from research.training.whole_model import example, quantised_denoiser, run_in_torch, save, whole_model
+from research.training.whole_model import example, quantised_denoiser, run_in_torch, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
 #: frame itself, and with room for the rows that are decoded for the next tiles.
@@ -101,7 +99,9 @@ def to_onnx(network: MultiResolutionFusion, contract: Contract, *, half: bool = 
     """
     inputs = network_example(network, contract.scale, contract.alignment)
     module = _with_onnx_channel_order(network)
-    translations = {torch.ops.aten.pixel_unshuffle.default: _space_to_depth}
+    # One operator instead of the exporter's dozen
+    unshuffle = torch.ops.aten.pixel_unshuffle.default
+    translations = {unshuffle: lambda x, downscale_factor: opset18.SpaceToDepth(x, blocksize=downscale_factor)}
     model = traced(module, inputs, ["lrhs", "hrls"], ["fused"], contract.alignment, translations)
     if half:
         _store_as_half(model.graph)
@@ -128,11 +128,6 @@ def joint_to_onnx(network: JointFusion, contracts: Sequence[Contract], pairs: Se
         ]
     fit = joint.fitted(network, max(contract.scale for contract in contracts), pairs)
     return [joint.to_onnx(network, fit, contract, layers) for contract in contracts]
-
-
-def _space_to_depth(x: Any, downscale_factor: int) -> Any:
-    """Unshuffle pixels by one operator instead of the exporter's dozen."""
-    return opset18.SpaceToDepth(x, blocksize=downscale_factor)
 
 
 def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionFusion:
@@ -200,20 +195,6 @@ def parity(network: Network, path: Path, denoise: MeanDenoiser | None = None) ->
     return worst
 
 
-def check_casts(path: Path) -> None:
-    """Refuse a file whose weights ONNX Runtime would cast in every run."""
-    options = onnxruntime.SessionOptions()
-    optimised = path.with_suffix(".optimised")
-    options.optimized_model_filepath = str(optimised)
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
-    onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    counts = collections.Counter(node.op_type for node in onnx.load(optimised).graph.node)
-    optimised.unlink()
-    if counts["Cast"]:
-        left = f"{counts['Cast']} casts of weights are left after loading"
-        raise SystemExit(f"{path}: {left}; they would slow every tile")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
@@ -247,18 +228,12 @@ def main() -> None:
         if len({contract.denoiser for contract in contracts}) > 1:
             raise SystemExit("--scale: these scales have other denoisers of both renders' mean; export each alone")
         denoiser = denoiser_for(network, contracts[0].denoiser)
-        pairs = joint.calibration_pairs(args.int8, scales, with_denoised_mean(denoiser), spread=network.spread)
+        pairs = joint.calibration_pairs(args.int8, scales, partial(with_denoised_mean, denoiser), spread=network.spread)
         graphs = joint_to_onnx(network, contracts, pairs)
     else:
         graphs = [to_onnx(network, contract, half=args.half) for contract in contracts]
-    models = {
-        file: whole_model(graph, contract, quantised_denoiser(contract.denoiser, args.denoiser))
-        for file, graph, contract in zip(files, graphs, contracts, strict=True)
-    }
-    save(models, args.name if len(scales) > 1 else "")
-    for file in files:
-        if args.half:
-            check_casts(file)
+    for file, graph, contract in zip(files, graphs, contracts, strict=True):
+        onnx.save(whole_model(graph, contract, quantised_denoiser(contract.denoiser, args.denoiser)), file)
         difference = parity(network, file, denoiser)
         print(f"{file}: {file.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {difference:.2g}")
 

@@ -11,7 +11,7 @@ of both renders' mean is in it, too.
 
 The log curve stays in float32, because half floats overflow in it. Weights are stored as 8-bit codes with a scale for
 each 3 x 3 kernel, and become half floats when the file is loaded. The networks of all scales have the same weights,
-which lie in a file that they share.
+which :mod:`research.training.share` then stores once.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from research.training.export import denoiser_for
 from research.training.joint import JointFusion
 from research.training.oidn import FineTunedUNet
 from research.training.tracing import network_example, prepend, traced
-from research.training.whole_model import SMALL, save, whole_model
+from research.training.whole_model import SMALL, whole_model
 
 #: Inputs of the denoiser of both renders' mean, see :func:`research.training.render_mean.mean_of_renders`.
 MEAN_CHANNELS = {"colour": 3, "noise": 1, "albedo": 3, "normal": 3}
@@ -140,13 +140,11 @@ def main() -> None:
     modes = {Contract.of_file(path).denoiser for path in args.models}
     denoisers = {mode: in_half_floats(denoiser_for(network, mode)) for mode in modes}
     network = joint_in_half_floats(network)
-    folder, family = args.models[0].parent / GPU_FOLDER, args.models[0].stem.rpartition("-x")[0]
-    folder.mkdir(exist_ok=True)
-    contracts = {folder / path.name: Contract.of_file(path) for path in args.models}
-    models = {path: to_onnx(network, contract, denoisers[contract.denoiser]) for path, contract in contracts.items()}
-    save(models, family)
-    for path in sorted([*models, *folder.glob("*.weights")]):
-        print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+    for path in args.models:
+        contract, file = Contract.of_file(path), path.parent / GPU_FOLDER / path.name
+        file.parent.mkdir(exist_ok=True)
+        onnx.save(to_onnx(network, contract, denoisers[contract.denoiser]), file)
+        print(f"{file}: {file.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

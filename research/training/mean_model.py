@@ -5,8 +5,8 @@
 
 This writes ``mean-x1.onnx`` beside the file for CPUs and, in the folder `gpu`, beside that for GPUs. It reads two
 renders of the same size, and returns their denoised mean. Passes of a pair at x2 are fused by it at half of the frame's
-resolution (:mod:`oiio_msspl.fusion.passes.network`). It has the contract of any other model, with a scale of 1. Its
-weights are those of the model that it is cut from, in the file that they share.
+resolution (:mod:`oiio_msspl.fusion.passes.network`). It has the contract of any other model, with a scale of 1, and the
+weights of the model that it is cut from.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 
     python -m research.training.share oiio_msspl/model/weights
 
-Two exports write the same tensor twice: the table of the PU curve, and networks that two models took from Open Image
-Denoise as they are. This moves such tensors into files that all of these models name. The tensors keep their bytes, so
+Two exports write the same tensor twice: the weights of all scales of a network, denoisers, the table of the PU curve.
+This moves such tensors into files that all of these models name. The tensors keep their bytes, so
 pixels stay as they are, and so do measurements: the tables of the benchmarks get the new digests. Run it after the last
 export; a second run changes nothing.
 """

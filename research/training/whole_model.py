@@ -21,11 +21,10 @@ import numpy as np
 import onnx
 import torch
 from onnx import helper
-from onnx.external_data_helper import set_external_data
 from torch import Tensor, nn
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.model.contract import DENOISERS, METADATA_KEY, ONE_SIZE, Contract
+from oiio_msspl.model.contract import METADATA_KEY, ONE_SIZE, Contract
 from oiio_msspl.model.encoding import MAX_ENCODED
 from research.training import CHECKPOINTS
 from research.training.encoding import encoded_feature, exposed_feature, log_decode, log_encode
@@ -38,7 +37,7 @@ from research.training.tracing import image_info, traced
 FULL_SIZE_DENOISER = CHECKPOINTS / "full_size_denoiser.onnx"
 #: Prefixes of tensors in the graph of a model.
 ENTER, NETWORK, DENOISER = "enter.", "network.", "denoiser."
-#: Tensors of fewer bytes, such as biases, stay in the graph.
+#: Tensors of fewer bytes, such as biases, are stored as they are.
 SMALL = 1024
 
 
@@ -192,50 +191,10 @@ def example(contract: Contract, height: int, width: int, seed: int = 0) -> dict[
 
 
 def denoiser_file(mode: str) -> str:
-    """Return the name, without its ending, of the files of a value of ``Contract.denoiser``."""
+    """Return the name, without its ending, of the file of a value of ``Contract.denoiser``."""
     return mode.replace("mean", "mean_denoiser").replace("-", "_")
 
 
 def quantised_denoiser(mode: str, file: Path | None = None) -> onnx.ModelProto | None:
     """Read the denoiser in 8 bits for a value of ``Contract.denoiser``: from a file, or the shipped one."""
     return onnx.load(file or CHECKPOINTS / f"{denoiser_file(mode)}.onnx") if mode else None
-
-
-def save(models: Mapping[Path, onnx.ModelProto], family: str = "") -> None:
-    """Save models into one folder.
-
-    Those with the same denoiser share its weights, in a file beside them. So all of them must be exported again when
-    it has changed.
-
-    Args:
-        family: if not empty, the models share all other weights, too, in ``FAMILY.weights``.
-    """
-    (folder,) = {path.parent for path in models}
-    for mode in DENOISERS:
-        group = [model for model in models.values() if _contract(model).denoiser == mode]
-        if group:
-            _share_weights(group, folder / f"{denoiser_file(mode)}.weights", DENOISER)
-    if family:
-        _share_weights(list(models.values()), folder / f"{family}.weights", NETWORK)
-    for path, model in models.items():
-        onnx.save(model, path)
-
-
-def _contract(model: onnx.ModelProto) -> Contract:
-    return Contract.from_json(next(item.value for item in model.metadata_props if item.key == METADATA_KEY), "model")
-
-
-def _share_weights(models: Sequence[onnx.ModelProto], file: Path, prefix: str) -> None:
-    """Move weights whose names begin with ``prefix`` into one file, equal ones once."""
-    places: dict[bytes, int] = {}
-    with file.open("wb") as out:
-        for model in models:
-            for tensor in model.graph.initializer:
-                data = tensor.raw_data
-                if len(data) < SMALL or not tensor.name.startswith(prefix):
-                    continue
-                if data not in places:
-                    places[data] = out.tell()
-                    out.write(data)
-                set_external_data(tensor, file.name, places[data], len(data))
-                tensor.ClearField("raw_data")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def pairs(scale, prepare, count=2, size=64):
 @pytest.fixture(scope="module")
 def denoised_mean():
     """Appends the mean of both renders, which `joint` has denoised."""
-    return with_denoised_mean(checkpoints.load(CHECKPOINT)[0].mean_denoiser)
+    return partial(with_denoised_mean, checkpoints.load(CHECKPOINT)[0].mean_denoiser)
 
 
 def means(size, scale=2):

@@ -223,24 +223,19 @@ def _needed(
 ) -> tuple[list[onnx.NodeProto], list[onnx.TensorProto]]:
     """Return the nodes and tensors that outputs need, the nodes in an order in which they can be computed."""
     makers = {name: node for node in nodes for name in node.output}
-    constants = {tensor.name: tensor for tensor in tensors}
     ordered: dict[str, onnx.NodeProto] = {}
-    used: dict[str, onnx.TensorProto] = {}
     waiting = outputs[::-1]
     while waiting:
-        name = waiting[-1]
-        if name in constants:
-            used[name] = constants[name]
-        missing = [n for n in makers[name].input if n in makers and n not in ordered] if name in makers else []
-        if missing:
-            waiting += missing
-            continue
-        waiting.pop()
-        if name in makers and name not in ordered:
-            node = makers[name]
+        node = makers[waiting[-1]]
+        missing = [name for name in node.input if name in makers and name not in ordered]
+        waiting += missing
+        if not missing:
+            waiting.pop()
             ordered |= dict.fromkeys(node.output, node)
-            used |= {n: constants[n] for n in node.input if n in constants}
-    return list({id(node): node for node in ordered.values()}.values()), list(used.values())
+    constants = {tensor.name: tensor for tensor in tensors}
+    kept = {id(node): node for node in ordered.values()}.values()
+    used = {name: constants[name] for node in kept for name in node.input if name in constants}
+    return list(kept), list(used.values())
 
 
 def main() -> None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure a result, and word a verdict from the figures."""
+"""Measure a result, and judge the figures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.image.arrays import Array, repair
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import max_around
 from oiio_msspl.image.metrics import psnr, relmse_map
 from oiio_msspl.model.encoding import KEY, find_exposure
 from research.benchmarks import results
@@ -66,8 +67,8 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
     grey = np.float32(find_exposure(truth))  # the scores are made for exposed pictures
     floor = np.float32(FLOOR * KEY) / grey
     low, high = input_range(pair)
-    low = np.minimum(low, window(truth, HRLS_REACH, np.minimum))
-    high = np.maximum(high, window(truth, HRLS_REACH, np.maximum))
+    low = np.minimum(low, highest(truth, HRLS_REACH, -1))
+    high = np.maximum(high, highest(truth, HRLS_REACH))
     beyond = np.maximum((image + floor) / (high + floor), (low + floor) / (np.maximum(image, 0) + floor))
     errors = relmse_map(image * grey, truth * grey).mean(axis=-1)
     row: dict[str, Any] = {
@@ -75,7 +76,6 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
         "relmse_trimmed": trimmed(errors),
         "relmse_enlarged": trimmed(relmse_map(enlarged * grey, truth * grey).mean(axis=-1)),
         "psnr": psnr(image * grey, truth * grey),
-        "outside": float((beyond > EXCESS).mean()),
         "range": float(beyond.max()),
         "holes": int(holes(image, truth, float(floor), pair.scale).sum()),
         "stamps": stamps(image, truth, float(floor)),
@@ -94,40 +94,31 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
 
 
 def verdict(row: dict[str, Any]) -> tuple[str, str]:
-    """Return "holds", "suffers" or "fails", and a sentence, from the figures of :func:`measure` and the ``group``."""
-    if not row["finite"]:
-        return "fails", "NaN or Inf comes out."
-    faults = []
-    if row["range"] > EXCESS:
-        faults.append(
-            f"leaves the inputs' range by up to x{row['range']:.3g} in {100 * row['outside']:.2g} % of values"
-        )
-    if row.get("deviation", 0) > DEVIATION:
-        faults.append(f"does not scale: off by up to {100 * row['deviation']:.2g} %")
-    if row.get("away", 0) > AWAY:
-        faults.append(f"changes by up to {100 * row['away']:.2g} % far from what changed")
-    counts = {fault: row[f"{fault}s"] for fault in ("hole", "stamp")}
-    faults += [f"{count} {fault}{'s' * (count > 1)}" for fault, count in counts.items() if count]
-    if row.get("cost", 0) > COST:
-        faults.append(f"costs {row['cost']:.1f} dB")
+    """Return "holds", "suffers" or "fails", and the faults, from the figures of :func:`measure` and the ``group``."""
     worse = row["relmse_trimmed"] > row["relmse_enlarged"]
-    if worse:
-        faults.append("worse than the LRHS merely enlarged")
-    silent = row["group"] == DISAGREE and row.get("cost", 0) > COST and not row["warnings"]
-    text = "; ".join(faults) or "within the inputs"
-    if "cost" in row and row["cost"] <= COST:
-        text += f"; costs {max(0.0, row['cost']):.1f} dB"
-    if row["warnings"] or silent:
-        text += "; the tool warns" if row["warnings"] else "; nothing is said"
-    return "fails" if worse or silent else "suffers" if faults else "holds", text[0].upper() + text[1:] + "."
+    costs = row.get("cost", 0) > COST
+    silent = row["group"] == DISAGREE and costs and not row["warnings"]
+    faults = {
+        "NaN or Inf": not row["finite"],
+        "outside the inputs' range": row["range"] > EXCESS,
+        "does not scale": row.get("deviation", 0) > DEVIATION,
+        "changes far from what changed": row.get("away", 0) > AWAY,
+        "holes": row["holes"] > 0,
+        "stamps": row["stamps"] > 0,
+        f"costs more than {COST:g} dB": costs,
+        "worse than the LRHS merely enlarged": worse,
+        "no warning": silent,
+    }
+    found = "; ".join(fault for fault, there in faults.items() if there)
+    return "fails" if worse or silent or not row["finite"] else "suffers" if found else "holds", found
 
 
 def judged(measured: Sequence[dict[str, Any]]) -> list[Row]:
-    """Return the table's rows: `KEYS`, `COLUMNS`, ``verdict`` and ``sentence``."""
+    """Return the table's rows: `KEYS`, `COLUMNS`, ``verdict`` and ``faults``."""
     rows = []
     for figures in measured:
         row = {key: figures[key] for key in (*KEYS, *COLUMNS) if key in figures} | results.model_of(figures["method"])
-        row["verdict"], row["sentence"] = verdict(figures)
+        row["verdict"], row["faults"] = verdict(figures)
         rows.append(row)
     return rows
 
@@ -168,7 +159,7 @@ def _sides(ratio: Array) -> NDArray[np.int64]:
     height, width = (n // CELL for n in ratio.shape)
     lines = ratio[: height * CELL, : width * CELL].reshape(height, CELL, width * CELL).mean(axis=1)
     steps = np.pad(np.diff(lines, axis=1), ((0, 0), (0, 1))).reshape(height, width, CELL)
-    across, inside = steps[:, :-1, -1], window(np.abs(steps[..., :-1]).max(axis=2), 1, np.maximum)
+    across, inside = steps[:, :-1, -1], max_around(np.abs(steps[..., :-1]).max(axis=2), 1)
     limit = np.maximum(math.log(STEP), STEP_INSIDE * np.maximum(inside[:, :-1], inside[:, 1:]))
     sides = np.zeros((height, width), np.int64)
     sides[:, :-1] += across > limit
@@ -182,17 +173,9 @@ def trimmed(errors: NDArray[np.float64]) -> float:
     return float(np.partition(errors.ravel(), kept - 1)[:kept].mean())
 
 
-def window(
-    values: NDArray[Any], reach: int, extreme: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
-) -> NDArray[Any]:
-    """Return the largest or smallest value within ``reach`` pixels along x and y."""
-    for axis in (0, 1):
-        size = values.shape[axis]
-        padded = np.pad(values, [(reach, reach) if i == axis else (0, 0) for i in range(values.ndim)], mode="edge")
-        views = [padded.take(range(start, start + size), axis) for start in range(2 * reach + 1)]
-        for view in views:
-            values = extreme(values, view)
-    return values
+def highest(values: NDArray[Any], reach: int, sign: int = 1) -> NDArray[Any]:
+    """Return the largest value within ``reach`` pixels along x and y; with a ``sign`` of -1 the smallest."""
+    return sign * max_around(sign * values, reach)
 
 
 def input_range(pair: Pair) -> tuple[Array, Array]:
@@ -200,9 +183,9 @@ def input_range(pair: Pair) -> tuple[Array, Array]:
     low, high = (repair(render.layers[RGB])[0] for render in (pair.lr, pair.hr))
     s = pair.scale
     result = []
-    for extreme in (np.minimum, np.maximum):
-        around = window(low, LRHS_REACH, extreme).repeat(s, 0).repeat(s, 1)
-        result.append(extreme(around, window(high, HRLS_REACH, extreme)))
+    for sign, extreme in ((-1, np.minimum), (1, np.maximum)):
+        around = highest(low, LRHS_REACH, sign).repeat(s, 0).repeat(s, 1)
+        result.append(extreme(around, highest(high, HRLS_REACH, sign)))
     return result[0], result[1]
 
 
@@ -216,7 +199,7 @@ def touched(before: Pair, after: Pair) -> NDArray[np.bool_]:
             return np.ones_like(high)
         high |= _differs(before.hr.layers[name], after.hr.layers[name])
     low |= high.reshape(low.shape[0], s, low.shape[1], s).any((1, 3))
-    return window(low, NEAR, np.maximum).repeat(s, 0).repeat(s, 1)
+    return max_around(low, NEAR).repeat(s, 0).repeat(s, 1)
 
 
 def _differs(a: Array, b: Array) -> NDArray[np.bool_]:

@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
-from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, HRLS_FEATURES, NORMAL, RGB, SPECULAR
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.metrics import psnr, relmse
@@ -38,20 +37,22 @@ REDUCED = {"channels": 32, "growth": 16, "groups": 2, "blocks": 3}
 SCALE, BATCH, PATCH, LEARNING_RATE = 4, 4, 96, 4e-4
 #: Batches that are drawn. Every row trains on them repeatedly.
 POOL = 400
-#: Features by the tables' names; each entry includes those before it.
-LAYERS = {"RGB": [RGB], "and albedo": [ALBEDO], "and normal": [NORMAL], "and diffuse, specular": [DIFFUSE, SPECULAR]}
-NONE, COLOUR, ALL = "none", "RGB", "and diffuse, specular"
 #: The paper's upper bound of radiance.
 CLIP = 100.0
 
 
+#: A render's first channels, in the order of :data:`oiio_msspl.aovs.features.HRLS_FEATURES`.
+COLOUR, ALL = 3, 15
+
+
 @dataclass(frozen=True)
 class Variant:
-    """One row of the tables."""
+    """One row of the table."""
 
     name: str
-    lrhs: str = COLOUR
-    hrls: str = COLOUR
+    lrhs: int = COLOUR
+    """How many of the first channels a branch reads."""
+    hrls: int = COLOUR
     loss: Callable[[Tensor, Tensor], Tensor] = losses.l1
 
 
@@ -61,9 +62,10 @@ def _in_linear(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Te
 
 VARIANTS = [
     Variant("both RGB, l1"),
-    *(Variant(f"HRLS: {name}", hrls=name) for name in (NONE, *LAYERS) if name != COLOUR),
-    *(Variant(f"LRHS: {name}", lrhs=name) for name in (NONE, ALL)),
-    *(Variant(f"robust loss, beta {beta:g}", loss=partial(losses.robust, beta=beta)) for beta in (0.01, 0.1, 1.0)),
+    Variant("HRLS: none", hrls=0),
+    Variant("HRLS: and diffuse, specular", hrls=ALL),
+    Variant("LRHS: and diffuse, specular", lrhs=ALL),
+    *(Variant(f"robust loss, beta {beta:g}", loss=partial(losses.robust, beta=beta)) for beta in (0.1, 1.0)),
     Variant("l1 of linear radiance", loss=_in_linear(losses.l1)),
     Variant("robust loss of linear radiance, beta 0.1", loss=_in_linear(losses.robust)),
 ]
@@ -89,11 +91,9 @@ def pair_of(view: View, top: int, left: int, patch: int, chosen: int) -> tuple[A
     return lrhs, hrls, as_float32(view.ref[rows, columns]) * np.float32(exposure)
 
 
-def channels_of(name: str) -> Tensor:
-    """Return the mask (1, 16, 1, 1) of the channels that a branch reads."""
-    names = list(LAYERS)[: list(LAYERS).index(name) + 1] if name in LAYERS else []
-    read = {feature for layers in names for feature in LAYERS[layers]}
-    return torch.cat([torch.full((n,), float(f in read)) for f, n in HRLS_FEATURES.items()])[None, :, None, None]
+def first(count: int) -> Tensor:
+    """Return the mask (16, 1, 1) of the first channels."""
+    return (torch.arange(HRLS_CHANNELS) < count).float()[:, None, None]
 
 
 def pool(views: list[View]) -> list[list[Tensor]]:
@@ -116,7 +116,7 @@ def train(variant: Variant, batches: list[list[Tensor]], steps: int) -> MultiRes
     network = MultiResolutionFusion(SCALE, **REDUCED, lrhs_channels=HRLS_CHANNELS)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
-    low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
+    low_mask, high_mask = first(variant.lrhs), first(variant.hrls)
     schedule = LambdaLR(optimizer, lambda step: min(1.0, 2 * (1 - step / steps)))  # constant, then linear to zero
     for step in range(steps):
         lrhs, hrls, target = (torch.rot90(image, step // POOL % 4, (2, 3)) for image in batches[step % POOL])
@@ -137,7 +137,7 @@ def evaluate(network: MultiResolutionFusion, variant: Variant, views: list[View]
     for view in views:
         *pair, reference = pair_of(view, 0, 0, view.ref.shape[0], 0)
         lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in pair)
-        fused = network(lrhs * channels_of(variant.lrhs), hrls * channels_of(variant.hrls))[0].permute(1, 2, 0)
+        fused = network(lrhs * first(variant.lrhs), hrls * first(variant.hrls))[0].permute(1, 2, 0)
         image = decode_radiance(fused.numpy(), 1.0)
         scored.append([psnr(image, reference), relmse(image, reference)])
     return dict(zip(("psnr", "relmse"), np.mean(scored, axis=0).tolist(), strict=True))

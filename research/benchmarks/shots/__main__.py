@@ -44,8 +44,7 @@ def measure(sequence: Sequence, made: list[Made]) -> Iterator[Row]:
         row |= {"model": method.model} if method.model else {}
         row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
         row |= {"relmse": relmse(method.images, sequence.truth), "flicker": flicker(images, truth)}
-        row |= {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
-        yield row | {"motion": method.motion}
+        yield row | {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
 
 
 def main() -> None:

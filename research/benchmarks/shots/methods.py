@@ -48,8 +48,6 @@ class Made:
     """Of the LRHS; 1 for what reads the full-resolution render with all samples."""
     images: Array
     """Linear (frames, h, w, 3)."""
-    motion: str = ""
-    """Say how the motion is known; empty for single frames."""
     model: str = ""
     """Of ours."""
 
@@ -75,7 +73,7 @@ def all_methods(
             for name, run in _by_scale(sequence, scale, options, Path(folder), spread=spread):
                 if fnmatchcase(name, pattern):
                     model = "" if isinstance(run, _RunOfPeer) else f"{run.settings.model}-x{scale}"
-                    yield Made(name, scale, _images(run), _motion(run.plan) if run.plan.count else "", model)
+                    yield Made(name, scale, _images(run), model)
 
 
 class _RunOfPeer(ShotRun):
@@ -121,12 +119,6 @@ def _by_scale(
     peers = {OIDN_NEIGHBOURS: oidn_prefiltered} | ({OIDN_SPLIT_NEIGHBOURS: oidn_split} if spread else {})
     for name, denoised in () if one else peers.items():
         yield name, _RunOfPeer(denoised, sequence.folder, settings, plan, shot.frames)
-
-
-def _motion(plan: ShotPlan) -> str:
-    """Say how the motion is known."""
-    motion = plan.views[None].motion
-    return f"{motion.kind}: {plan.text}" if motion else plan.text
 
 
 def _images(run: ShotRun) -> Array:

@@ -111,7 +111,6 @@ def test_frames_of_another_program_are_averaged_along_the_motion(sequence, monke
     single, *averaged = ((m.images - sequence.truth[0])[:, :, STEP * FRAMES : -STEP * FRAMES] for m in made)
     for errors in averaged:
         assert np.square(errors).mean() < 0.5 * np.square(single).mean()
-    assert not made[0].motion and "motionBack" in made[1].motion
 
 
 def test_a_sequence_without_vectors_has_its_other_files(sequence, tmp_path):

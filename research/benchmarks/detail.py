@@ -35,6 +35,8 @@ NETWORK_ALONE = ", network alone"
 
 Y, X = np.mgrid[: SIDE * SUB, : SIDE * SUB].astype(np.float32) / SUB
 SHAPE = X.shape
+#: Lines of several widths.
+LINES = (np.floor(X / (1 + np.floor(Y / 32))) % 2 == 1) & (X > 40) & (X < 216)
 
 
 def _grey(values: Array) -> Array:
@@ -43,8 +45,7 @@ def _grey(values: Array) -> Array:
 
 def display() -> Scene:
     """Return a screen that shows lines of several widths, before a dim wall."""
-    lit = (np.floor(X / (1 + np.floor(Y / 32))) % 2 == 1) & (X > 40) & (X < 216)
-    return Scene(surface(SHAPE, ambient=0.05, emission=_grey(0.9 * lit) * np.array((0.3, 0.9, 1.0), np.float32)))
+    return Scene(surface(SHAPE, ambient=0.05, emission=_grey(0.9 * LINES) * np.array((0.3, 0.9, 1.0), np.float32)))
 
 
 def leather() -> Scene:
@@ -98,8 +99,7 @@ def blue_lamp() -> Scene:
 
 def painted_wall() -> Scene:
     """Return lines that the albedo shows: a control."""
-    lines = (np.floor(X / (1 + np.floor(Y / 32))) % 2 == 1) & (X > 40) & (X < 216)
-    return Scene(surface(SHAPE, albedo=_grey(0.1 + 0.7 * lines), direct=0.6, visible=0.5, ambient=0.1))
+    return Scene(surface(SHAPE, albedo=_grey(0.1 + 0.7 * LINES), direct=0.6, visible=0.5, ambient=0.1))
 
 
 def rare_light() -> Scene:

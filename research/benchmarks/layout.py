@@ -108,16 +108,14 @@ class Table:
         if column.how not in ("difference", "interval", "ratio", "ratio interval"):
             used += chosen
             return _summary(column, chosen)
-        pairs = [(row, peers.get(self._peer_key(row, against))) for row in chosen]
+        keys = ("source", *self.keys)
+        changed = [(row, {**row, **(against(row) if callable(against) else against)}) for row in chosen]
+        pairs = [(row, peers.get(tuple(peer.get(name) for name in keys))) for row, peer in changed]
         compared = [(row, peer) for row, peer in pairs if peer is not None and column.measure in peer]
         if len(compared) < len(pairs) or all(row == peer for row, peer in pairs):
             return ""
         used += itertools.chain.from_iterable(compared)
         return _comparison(column, compared)
-
-    def _peer_key(self, row: Row, against: Mapping[str, Any] | Callable[[Row], Mapping[str, Any]]) -> tuple[Any, ...]:
-        peer = {**row, **(against(row) if callable(against) else against)}
-        return tuple(peer.get(name) for name in ("source", *self.keys))
 
 
 def _measures(column: Column) -> list[str]:

@@ -22,7 +22,7 @@ from typing import Any
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import ONE_SIZE, SPREAD
 from research.benchmarks import detail, passes, results, runtime
-from research.benchmarks.layout import Column, Line, Table, Wanted, clean
+from research.benchmarks.layout import Column, Line, Table, clean
 from research.benchmarks.one_size import SEEDS
 from research.benchmarks.results import MEAN, Row
 from research.benchmarks.runtime import SAME_WORK
@@ -30,11 +30,6 @@ from research.benchmarks.scenes import NOISY_REFERENCE
 from research.benchmarks.shots import methods as shots
 
 ROOT = Path(__file__).parents[2]
-
-
-def _on(instructions: str) -> dict[str, Wanted]:
-    """Return the condition that a row was measured on a processor with these instructions for networks."""
-    return {"machine": lambda name: name is not None and name.endswith(instructions)}
 
 
 FAST, BALANCED, BEST = "joint-small-x2", "joint-x2", "joint-large-x2"
@@ -416,7 +411,10 @@ def measured_models() -> str:
     sets = [results.where(results.read(table), scene=MEAN) for table in ("accuracy", "accuracy_gauss")]
     means = [results.index(rows, "spp", "method") for rows in sets]
     times = results.read("time_frame")
-    runs = [results.index(results.where(times, **_on(ending)), "method") for ending in MACHINES.values()]
+    runs = [
+        results.index([row for row in times if row["machine"].endswith(ending)], "method")
+        for ending in MACHINES.values()
+    ]
     lines = [",".join(["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp", *(f"time_{x.lower()}" for x in MACHINES)])]
     for name in shipped_models():
         rows = [means[f"{SPREAD}-x" in name].get((spp, name)) for spp in (2, 8)]

@@ -20,11 +20,6 @@ _DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
-def _linear(image: np.ndarray) -> np.ndarray:
-    """sRGB 0..1 to linear."""
-    return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
 @cache
 def read_image(path: str, limit: int = 512) -> np.ndarray:
     """Read an 8-bit image as linear float32 (H, W, 3), no larger than `limit`."""
@@ -33,7 +28,9 @@ def read_image(path: str, limit: int = 512) -> np.ndarray:
     with Image.open(path) as file:
         image = file.convert("RGB")
         image.thumbnail((limit, limit))
-        return np.clip(_linear(np.asarray(image, np.float32) / 255), 0.003, 0.95)
+        encoded = np.asarray(image, np.float32) / 255  # sRGB
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.clip(linear, 0.003, 0.95)
 
 
 @cache

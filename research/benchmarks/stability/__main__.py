@@ -22,7 +22,7 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.compare import upsample_bicubic
 from oiio_msspl.image.arrays import Array, repair
 from oiio_msspl.model.catalogue import find_model, shipped_models
-from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.contract import CLEAN, SCALES
 from oiio_msspl.model.session import Session
 from research.benchmarks import peers, results
 from research.benchmarks.stability import cases
@@ -75,7 +75,9 @@ def main() -> None:
     parser.add_argument("--scale", type=int, nargs="+", choices=SCALES, default=[2, 4], help="default: 2 4")
     parser.add_argument("--size", type=int, default=SIZE, help="side of the frames (%(default)s)")
     args = parser.parse_args()
-    files = [find_model(4, name) for name in args.model] or list(shipped_models().values())
+    # The models for little noise never see renders of so few samples.
+    shipped = [file for name, file in shipped_models().items() if CLEAN not in name]
+    files = [find_model(4, name) for name in args.model] or shipped
     sessions = [Session(file) for file in files]
     peer: dict[str, Method] = {"OIDN prefiltered on the HRLS": lambda pair: (peers.oidn_prefiltered(pair.hr), [])}
     rows = []

@@ -91,8 +91,8 @@ def fuse_shot(
             their entries of an earlier report.
         begin: called before the first frame is fused with the report, whose ``found`` and ``temporal`` say what will be
             done. It is not called if no frame is to be fused.
-        progress: called after each frame with its result and the report so far. Frames that are skipped, missing or
-            blocked by an existing file come first.
+        progress: called after each frame with its result and the report so far, on the thread that writes frames.
+            Frames that are skipped, missing or blocked by an existing file come first.
         client: a client of a Dask cluster that sees the same files, see
             :func:`oiio_msspl.jobs.farm.dask.connect`. The cluster's workers fuse the frames, which then end in any
             order. None fuses in this process.
@@ -152,13 +152,12 @@ def fuse_shot(
     remove_leftovers([*targets, *([] if path is None else [path])])
     try:
         if client is None:
-            run_pipeline(ShotRun(settings, plan, to_fuse), running.add_outcome, running.save)
+            run_pipeline(ShotRun(settings, plan, to_fuse), running.add_outcome)
         else:
             for doubt in check_first_pair(to_fuse, inputs):
                 log.warning("%s", doubt)
             for frame, outcome in fuse_frames(client, settings, plan, to_fuse):
                 running.add_outcome(frame, outcome)
-                running.save()
             remove_leftovers(targets)  # of workers that died
     finally:
         running.close()
@@ -205,6 +204,7 @@ class _RunningReport:
         return to_fuse, skipped
 
     def add_outcome(self, frame: FrameFiles, outcome: Outcome) -> None:
+        """Add a frame that ended, and save the report. A full disk may have room later, so it is only logged."""
         if isinstance(outcome, Exception):
             log.debug("frame %d", frame.number, exc_info=outcome)
             self.add(result_of(frame, FAILED, *explain(outcome)))
@@ -212,9 +212,6 @@ class _RunningReport:
             self.add(result_of(frame, SKIPPED))
         else:
             self.add(fused_result(frame, outcome, self.report))
-
-    def save(self) -> None:
-        """Save the report after a frame. A failure is only logged, because a full disk may have room later."""
         try:
             self.close()
         except MssplError as error:

@@ -19,11 +19,11 @@ from oiio_msspl._version import full_version
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.jobs import existing, memory, pipeline, shot, write
+from oiio_msspl.jobs import existing, memory, pipeline, write
 from oiio_msspl.jobs import run as run_module
 from oiio_msspl.jobs.plan import TemporalOptions
 from oiio_msspl.jobs.run import ShotRun
-from oiio_msspl.jobs.shot_report import fused_result, read_earlier
+from oiio_msspl.jobs.shot_report import read_earlier
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot, write_png
@@ -558,23 +558,6 @@ def test_a_view_that_the_first_frame_lacks_is_a_warning(tmp_path, bilinear_model
 
 
 # ------------------------------------------------------------------------------------------------ runs that are ended
-
-
-def test_a_signal_between_writing_and_recording_loses_no_frame(tmp_path, bilinear_models, monkeypatch):
-    folder, recorded = make_shot(tmp_path, 4), fused_result
-    moments = iter([None, KeyboardInterrupt])
-
-    def interrupted(*arguments):
-        if moment := next(moments, None):
-            raise moment
-        return recorded(*arguments)
-
-    monkeypatch.setattr(shot, "fused_result", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run(folder, bilinear_models[4], report_path=folder / "r.json", previews=False)
-    report = json.loads((folder / "r.json").read_text())
-    files = sorted(path.name for path in (folder / "out").iterdir())
-    assert files == [f"beauty.{entry['frame']}.exr" for entry in report["frames"]] != []
 
 
 def test_a_frame_that_is_handed_over_as_the_signal_comes_is_reported(tmp_path, bilinear_models, monkeypatch):

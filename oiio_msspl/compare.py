@@ -19,7 +19,7 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
-from oiio_msspl.image.arrays import HALF_MAX, Array, repair
+from oiio_msspl.image.arrays import Array, repair
 from oiio_msspl.image.colour import converted, same_space, space_of
 from oiio_msspl.image.metrics import RELMSE_GHARBI, SSIM_WINDOW, psnr, relmse, relmse_map, ssim
 from oiio_msspl.jobs.report import WEIGHTS_ATTRIBUTE
@@ -83,7 +83,7 @@ def open_comparison(images: Sequence[Path], reference: Path | None = None, layer
 
     Returns:
         The files with the first view, or view layer, of the first image. A file that lacks it takes part with its own
-        first one, see :func:`note_on_views`.
+        first one, see :func:`notes`.
 
     Raises:
         InputError: a file can't be read, lacks the beauty or the layer, or see :func:`common_windows`.
@@ -116,50 +116,26 @@ def in_space_of(rgb: Array, render: MappedRender, target: MappedRender) -> Array
     return rgb if source_space is None or target_space is None else converted(rgb, source_space, target_space)
 
 
-def note_on_spaces(comparison: Comparison) -> str:
-    """Say which pictures are converted to another linear RGB space; empty if none is."""
-    largest = comparison.renders[comparison.largest]
-    target = space_of(largest.metadata)
-    if target is None:
-        return ""
-    spaces = {render.name: space_of(render.metadata) for render in comparison.renders}
-    names = [f"{name} ({space.name})" for name, space in spaces.items() if space and not same_space(space, target)]
-    return f"Converted to {target.name}, the colour space of {largest.name}: {', '.join(names)}" if names else ""
-
-
-def note_on_views(comparison: Comparison) -> str:
-    """Say that a file lacks the view, or view layer, of the first image; empty if all have it or none has several."""
-    renders = comparison.renders
-    is_in_all = all(renders[0].view in (render.view, *render.view.split("/")) for render in renders)
-    if is_in_all or not any(render.other_views for render in renders):
-        return ""
-    return f"Different views are compared: {', '.join(f'{name_of(r.view)} of {r.name}' for r in renders)}"
-
-
-def note_on_weights(comparison: Comparison) -> str:
-    """Say that different versions or weights fused these files; empty if the same did, or only one is fused."""
+def notes(comparison: Comparison) -> list[str]:
+    """Say by the headers which files differ in view, window, colour space, or the weights that fused them."""
+    renders, largest, said = comparison.renders, comparison.renders[comparison.largest], []
+    view_is_in_all = all(renders[0].view in (render.view, *render.view.split("/")) for render in renders)
+    if not view_is_in_all and any(render.other_views for render in renders):
+        said.append(f"Different views are compared: {', '.join(f'{name_of(r.view)} of {r.name}' for r in renders)}")
+    if comparison.windows != [render.data_window for render in renders]:
+        part = comparison.windows[comparison.largest]
+        said.append(f"The data windows differ; only the part that all pictures show is compared: {part}")
+    if target := space_of(largest.metadata):
+        spaces = {render.name: space_of(render.metadata) for render in renders}
+        others = [f"{name} ({space.name})" for name, space in spaces.items() if space and not same_space(space, target)]
+        if others:
+            said.append(f"Converted to {target.name}, the colour space of {largest.name}: {', '.join(others)}")
     names = ("msspl/version", WEIGHTS_ATTRIBUTE)
-    makers = {r.name: [r.metadata[name] for name in names if name in r.metadata] for r in comparison.renders}
-    fused = {name: ", ".join(maker) for name, maker in makers.items() if maker}
-    if len(set(fused.values())) < 2:
-        return ""
-    return f"Different versions or weights made these: {'; '.join(f'{k} ({v})' for k, v in fused.items())}"
-
-
-def notes_on_broken(comparison: Comparison) -> list[str]:
-    """Say of every render that was read how many values are NaN or infinite, unless none is."""
-    return [
-        f"{name}: {count} values are NaN or infinite; NaN counts as black here, infinity as {HALF_MAX:.0f}"
-        for name, count in comparison.broken.items()
-    ]
-
-
-def note_on_windows(comparison: Comparison) -> str:
-    """Say which part is compared if not all files show the whole frame; empty if all pixels are compared."""
-    if comparison.windows == [render.data_window for render in comparison.renders]:
-        return ""
-    part = comparison.windows[comparison.largest]
-    return f"The data windows differ; only the part that all pictures show is compared: {part}"
+    makers = {r.name: ", ".join(r.metadata[name] for name in names if name in r.metadata) for r in renders}
+    fused = {name: maker for name, maker in makers.items() if maker}
+    if len(set(fused.values())) > 1:
+        said.append(f"Different versions or weights made these: {'; '.join(f'{k} ({v})' for k, v in fused.items())}")
+    return said
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,6 @@ EXAMPLES = """[bold]Examples[/bold]
 #: A page of more bytes loads slowly.
 LARGE_PAGE = 60_000_000
 
-
 _REFERENCE = "Measure against this converged render. Only --html works without it."
 _HTML = "Write a page to look at all pictures in a browser, with their layers and errors."
 _LAYERS = "Show these layers on the page (light*). May be repeated. \\[default: those that sum to the beauty]"
@@ -53,17 +52,9 @@ def compare(
     than the reference by x2, x4 or x8 are upsampled bicubically first. Of files
     with several views, the first view of the first image is compared.
     """
-    from oiio_msspl.compare import (
-        check_page,
-        note_on_spaces,
-        note_on_views,
-        note_on_weights,
-        note_on_windows,
-        notes_on_broken,
-        open_comparison,
-        score_images,
-    )
+    from oiio_msspl.compare import check_page, notes, open_comparison, score_images
     from oiio_msspl.compare_page import check_layers
+    from oiio_msspl.image.arrays import HALF_MAX
 
     if reference is None and html is None:
         raise InputError("scores need --reference; without one, --html writes a page to look at")
@@ -74,12 +65,12 @@ def compare(
     comparison = open_comparison(images, reference, _layer(mapping))
     if html is not None:
         check_layers(comparison, layers)
-    for note_on in (note_on_views, note_on_windows, note_on_spaces, note_on_weights):
-        if note := note_on(comparison):
-            console.say(note, error=True)
+    for note in notes(comparison):
+        console.say(note, error=True)
     results = score_images(comparison) if reference else [{} for _ in images]
-    for note in notes_on_broken(comparison):
-        console.say(f"warning: {note}", error=True)
+    for name, count in comparison.broken.items():
+        counts_as = f"NaN counts as black here, infinity as {HALF_MAX:.0f}"
+        console.say(f"warning: {name}: {count} values are NaN or infinite; {counts_as}", error=True)
     wrote = _write_page(html, comparison, layers, overwrite) if html else ""
     if as_json:
         # The PSNR of equal pictures is infinite, which JSON can't express.

@@ -9,8 +9,8 @@ The page is one file: ``compare_page.html`` with the pixels in it. It asks the n
 
 So a step is about as large as one of an 8-bit sRGB picture near white, and smaller elsewhere, at any exposure. Three
 planes of codes are stored: green, red minus green, blue minus green. The noise of a render is mostly brightness, so the
-differences are nearly free of it and take little space. If that is smaller, a code is stored as the difference to its
-left neighbour. Then come the low bytes of all codes, then the high bytes, in zlib's format and base64.
+differences are nearly free of it and take little space. Each code is stored as the difference to its left neighbour,
+with the sign as the lowest bit: the low bytes of all, then the high bytes, in zlib's format and base64.
 
 PNGs would not be safer: browsers that protect against tracking change the pixels that a page reads from a picture.
 """
@@ -249,32 +249,24 @@ def to_codes(values: Array) -> Codes:
     return np.round(CODES_PER_STOP * stops).astype(np.int16)
 
 
-def pack(codes: Codes) -> tuple[bytes, bool]:
-    """Compress codes (height, width, 1 or 3), and return whether they are differences to the left neighbour."""
-    planes = np.ascontiguousarray(np.moveaxis(codes, -1, 0))
+def pack(codes: Codes) -> bytes:
+    """Compress codes (height, width, 1 or 3), see the head of this module."""
+    planes = np.moveaxis(codes, -1, 0)
     if len(planes) == 3:
         planes = np.stack([planes[1], planes[0] - planes[1], planes[2] - planes[1]])
     differences = np.diff(planes, axis=-1, prepend=np.int16(0))
-    # Every 16th row tells which is smaller.
-    smooth = len(_compressed(differences[:, ::16], 1)) < len(_compressed(planes[:, ::16], 1))
-    return _compressed(differences if smooth else planes, 6), smooth
-
-
-def _compressed(planes: Codes, effort: int) -> bytes:
-    """Compress the low bytes, then the high bytes; the sign is the lowest bit, so high bytes are mostly 0."""
-    unsigned = ((planes << 1) ^ (planes >> 15)).view(np.uint16)
+    unsigned = ((differences << 1) ^ (differences >> 15)).view(np.uint16)
     low, high = (unsigned & 255).astype(np.uint8), (unsigned >> 8).astype(np.uint8)
     # In noise, short repetitions are chance. This strategy ignores them, which saves 4 %.
-    compressor = zlib.compressobj(effort, strategy=zlib.Z_FILTERED)
+    compressor = zlib.compressobj(strategy=zlib.Z_FILTERED)
     return compressor.compress(low.tobytes()) + compressor.compress(high.tobytes()) + compressor.flush()
 
 
 def _write_codes(out: TextIO, name: str, codes: Codes) -> dict[str, Any]:
     """Write codes (height, width, channels) as an element of the page, and return how the manifest describes it."""
-    data, smooth = pack(codes)
-    out.write(f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>\n')
+    out.write(f'<script type="text/plain" id="{name}">{base64.b64encode(pack(codes)).decode()}</script>\n')
     height, width, channels = codes.shape
-    return {"id": name, "width": width, "height": height, "channels": channels, "differences": smooth}
+    return {"id": name, "width": width, "height": height, "channels": channels}
 
 
 def _manifest(

@@ -95,8 +95,6 @@ class ExistingResults:
     def _check_targets(self, files: FrameFiles) -> None:
         """Raise InputError if a result can't be written."""
         overwrite = self.replaces(files)
-        if files.output.is_symlink() and not files.output.exists() and not overwrite:
-            raise InputError("the output is a link to a file that does not exist; delete the link")
         if files.output.exists() and not files.output.is_dir() and not overwrite:
             raise InputError("the output exists; pass --skip-existing or --overwrite")
         check_target(files.output, overwrite=overwrite)

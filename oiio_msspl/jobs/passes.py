@@ -90,7 +90,5 @@ def costs_of(views: Sequence[MappedRender], session: Session, write: WriteOption
         costs.append(megapixels * of_tiles)
         if sets := sets_to_fuse(hr, write):
             costs.append(megapixels * of_layer * sum(len(additive.layers) for additive in sets))
-    file, dropped = views[-1].file, dropped_channels(views[-1].file, views[-1].beauty_channels, write.layers)
-    areas = (part.data_window.width * part.data_window.height / 1e6 for part in file.parts)
-    kept = (sum(channel not in dropped for channel in part.channels) for part in file.parts)
-    return [*costs, WRITTEN_CHANNEL * sum(area * count for area, count in zip(areas, kept, strict=True))]
+    channels = sum(len(part.channels) for part in views[-1].file.parts)
+    return [*costs, WRITTEN_CHANNEL * megapixels * channels]

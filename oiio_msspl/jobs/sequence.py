@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import fileseq
@@ -241,10 +241,8 @@ def next_file(path: Path) -> Path | None:
     numbered = frame_in_name(path)
     if numbered is None:
         return None
-    pattern, number = numbered
-    # Frame 0 comes after -001 or after -0001.
-    patterns = (pattern, replace(pattern, width=pattern.width - 1)) if number < 0 else (pattern,)
-    return next((file for file in (each.path(number + 1) for each in patterns) if file.is_file()), None)
+    file = numbered[0].path(numbered[1] + 1)
+    return file if file.is_file() else None
 
 
 def _numbered(match: re.Match[str]) -> tuple[str, int, int, str]:
@@ -331,13 +329,8 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
         f"{path} has {', '.join(sequence.pattern.name for sequence in sequences[:6])}"
         for path, sequences in ((lr, lows), (hr, highs))
     )
-    # If both are one folder, a sequence may not be paired with itself.
-    pairs = [(low, high) for low, high in pairs if str(low.pattern) != str(high.pattern)]
-    why = f"{len(pairs)} sequences go by the same name in both" if pairs else "none has the same name in both"
-    if lr == hr:
-        why = "both are to be in one folder"
     raise InputError(
-        f"which sequences belong together? {seen}, and {why}; name the two as patterns, the low-resolution one first"
+        f"which sequences belong together? {seen}; name the two as patterns, the low-resolution one first"
     )
 
 

@@ -177,6 +177,7 @@ class RenderedShot:
             self._renders[files.number] = files
             for frame in run.take(views):
                 self._at_work = frame.number
+                frame.require()
                 first, last = (str(beside(frame.files.output, self.suffixes[index])) for index in (0, -1))
                 frame.report.sources = (first, last) if self._keep else ("a render that was not kept",) * 2
                 write_settled(frame, run.existing)
@@ -203,11 +204,7 @@ class RenderedShot:
             # The format need not be verified: Blender is known, and motion blur is off.
             motion = MotionSource(VECTORS, plan.text, hr.motion.fields)
             plan = replace(plan, views={None: ViewPlan(plan.views[None].reach, motion)})
-
-        def tell_frame(number: int) -> None:
-            self._at_work = number
-
-        return ShotRun(self._settings, plan, self._wanted, stops_at=tell_frame)
+        return ShotRun(self._settings, plan, self._wanted, yields_errors=True)
 
     def _keep_failed(self, files: FrameFiles, said: str) -> str:
         """Keep the renders of a frame that can't be fused. The rest of the temporary files is deleted.

@@ -11,7 +11,6 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 from functools import partial
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, VARIANCE
@@ -30,7 +29,7 @@ from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import Array, Mask, kept
 from oiio_msspl.jobs.inputs import MappedPair, files_by_name, find_views, map_pair
 from oiio_msspl.jobs.memory import ViewMemory, budget_view, light_features
-from oiio_msspl.jobs.passes import Progress, check_layers, sets_to_fuse
+from oiio_msspl.jobs.passes import check_layers, sets_to_fuse
 from oiio_msspl.jobs.plan import ShotPlan, ViewPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import FrameFiles
@@ -40,36 +39,18 @@ from oiio_msspl.model.contract import ONE_SIZE
 from oiio_msspl.model.session import Session
 
 
-class State(IntEnum):
-    """How far a frame has come."""
-
-    FOUND = 0
-    """Its files are known."""
-    READ = 1
-    """Its pair is open and mapped. Its pixels are in memory, if there is room."""
-    AVERAGED = 2
-    """Its renders are averaged with those of its neighbours."""
-    FUSED = 3
-    """The network has fused it."""
-    SETTLED = 4
-    """Its picture is averaged with those of its neighbours, and its passes are fused."""
-    WRITTEN = 5
-    """Its EXR is on the disk."""
-
-
 class NoSuchView(InputError):
     """A frame lacks a view that other frames of the shot have."""
 
 
 @dataclass(eq=False)
 class ShotFrame:
-    """One view of a frame. ``state`` says which of its attributes are set."""
+    """One view of a frame on its way from its files to its EXR."""
 
     files: FrameFiles
     view: str | None = None
     """The name of a view beside the first one; None for the first one, whose name may differ from frame to frame."""
     plan: ViewPlan = field(default_factory=ViewPlan)
-    state: State = State.FOUND
     error: Exception | None = None
     """Why it did not come further."""
     warnings: list[Finding] = field(default_factory=list)
@@ -77,7 +58,9 @@ class ShotFrame:
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time by what it was spent on: ``read`` and ``fuse``."""
 
-    # From READ on
+    was_read: bool = False
+    """Whether its pair is open and mapped, which sets the attributes below. Its pixels are in memory, if there is room.
+    """
     lr: MappedRender = field(init=False)
     hr: MappedRender = field(init=False)
     stored: tuple[MappedRender, MappedRender] = field(init=False)
@@ -95,7 +78,7 @@ class ShotFrame:
     passed_on: tuple[str, ...] = ()
     """Of the first view: why further views are not fused, one sentence each."""
 
-    # From AVERAGED on
+    # Once its renders are averaged with those of its neighbours
     averaged: RenderPair = field(init=False)
     """The means over neighbours; ``renders`` if there are none. Given up when the frame is fused."""
     means: tuple[Render, Render] | None = None
@@ -106,16 +89,13 @@ class ShotFrame:
     session: Session = field(init=False)
     """The model for the scale of the pair."""
 
-    # From FUSED on
+    # Once the network has fused it
     fused: FusedFrame | None = None
     """As the network fused it, for as long as a frame needs it."""
     replaced: ReplacedChannels | None = None
     """Of the first view: the channels of other views, fused."""
 
-    progress: Progress | None = None
-    """Joins the progress of the parts of the work, if somebody wants to know it."""
-
-    # From SETTLED on
+    # Once its picture is averaged with those of its neighbours, and its passes are fused
     picture: FusedFrame | None = None
     """What is written, until it is."""
     report: FrameReport = field(init=False)
@@ -184,10 +164,10 @@ def read_frame(files: FrameFiles, settings: Settings, plan: ShotPlan, *, only_fr
             with frame.attempt():
                 if not only_frame:
                     _read_pixels(frame)
-                frame.state = State.READ
+                frame.was_read = True
         first.seconds["read"] = time.perf_counter() - start
     for frame in frames[1:]:
-        if frame.state < State.READ and frame.error is None:
+        if not frame.was_read and frame.error is None:
             frame.error = first.error or NoSuchView(f"it has no pair for {name_of(frame.view or '')}")
     return frames
 
@@ -206,7 +186,7 @@ def _open(frames: Sequence[ShotFrame], settings: Settings) -> list[ShotFrame]:
     pairs[None] = views[0]
     present = [frame for frame in frames if frame.view in pairs]
     planned = {frame.view for frame in frames}
-    first.others = [ShotFrame(files, name, state=State.READ) for name in pairs if name not in planned]
+    first.others = [ShotFrame(files, name, was_read=True) for name in pairs if name not in planned]
     for frame in (*present, *first.others):
         _set_pair(frame, *pairs[frame.view], settings)
     return present

@@ -52,8 +52,6 @@ class ViewMemory:
     neighbours."""
     waiting: int
     """The most memory that the frames of this view take while another view is fused."""
-    other_views: int
-    """What frames of other views take while this one is fused."""
 
 
 def budget_view(
@@ -87,7 +85,7 @@ def budget_view(
         held += in_memory + _vector_bytes(hr, vectors_ahead)
     # Renders that are averaged wait in temporary files, because several views are.
     waiting += 0 if reach.renders else pixels
-    return ViewMemory(features, channels, fits, on_disk, vectors_ahead, held, waiting, other_views)
+    return ViewMemory(features, channels, fits, on_disk, vectors_ahead, held, waiting)
 
 
 def _waiting_means(lr: MappedRender, hr: MappedRender, reach: Reach) -> int:

@@ -73,8 +73,6 @@ class FrameReport:
     render does by its variance; None without trust."""
     frames_counted: float | None = None
     """How many frames a pixel is the mean of, in the mean over the first view; None without neighbours."""
-    network_seconds: float = 0.0
-    """``seconds["network"]``, known before the others."""
     other_views: list[FrameReport] = field(default_factory=list)
     """The views and view layers that were fused beside the first one. Counts, warnings and passes of this report are
     about all views; those of another view than the first have its name in front."""
@@ -154,7 +152,7 @@ class FrameReport:
 def report_on(
     lr: MappedRender, hr: MappedRender, session: Session, fused: FusedFrame, output: Path, preview_path: Path | None
 ) -> FrameReport:
-    """Report on a frame that is fused and not yet written: ``seconds`` is still empty."""
+    """Report on a frame that is fused and not yet written: ``seconds`` are those of the network."""
     warnings = spp_warnings(lr, hr, session.contract)
     if ALBEDO in session.contract.hrls and ALBEDO not in hr.features:
         text = "no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"
@@ -174,13 +172,12 @@ def report_on(
         negative=fused.negative,
         warnings=[*warnings, *fused.warnings, *_pass_warnings(hr, fused)],
         tiles=fused.tiles,
-        seconds={},
+        seconds={"network": fused.seconds},
         features=frozenset(read),
         lrhs_aovs=tuple(session.contract.lrhs[1:]),
         passes=_passes(fused),
         trust=None if fused.trust is None else float(fused.trust.mean()),
         frames_counted=None if fused.frames is None else float(fused.frames.mean(dtype=np.float64)),
-        network_seconds=fused.seconds,
         fused_sets=[job.written for job in fused.passes.jobs] if fused.passes else [],
     )
 
@@ -195,7 +192,7 @@ def add_other_views(report: FrameReport, views: Sequence[FrameReport], passed_on
         report.repaired |= {f"{name}: {key}": count for key, count in view.repaired.items()}
         report.negative |= {f"{name}: {key}": count for key, count in view.negative.items()}
         report.tiles += view.tiles
-        report.network_seconds += view.network_seconds
+        report.seconds["network"] += view.seconds["network"]
 
 
 def merged(sentences: Mapping[str, Sequence[Finding]]) -> list[Finding]:

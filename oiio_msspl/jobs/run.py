@@ -38,7 +38,7 @@ from oiio_msspl.fusion.tiles.tiling import require_memory, strips_memory
 from oiio_msspl.image.arrays import HALF_MAX, kept
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.existing import ExistingResults
-from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State, features_read, read_frame
+from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, features_read, read_frame
 from oiio_msspl.jobs.memory import check_frame_memory, light_features
 from oiio_msspl.jobs.passes import Progress, costs_of, sets_to_fuse
 from oiio_msspl.jobs.plan import ShotPlan
@@ -57,7 +57,7 @@ class ShotRun:
         wanted: the frames to write.
         only_frame: the shot is a single frame, which has all memory to itself.
         tell: called with (thousandths done, 1000) of the work on a single frame.
-        stops_at: the first error of a frame is raised, and not passed on with the frame, after a call with its number.
+        yields_errors: :meth:`take` also yields a frame with an error that is not to be written.
     """
 
     def __init__(
@@ -68,10 +68,11 @@ class ShotRun:
         *,
         only_frame: bool = False,
         tell: Callable[[int, int], None] | None = None,
-        stops_at: Callable[[int], None] | None = None,
+        yields_errors: bool = False,
     ) -> None:
         self.settings, self.plan = settings, plan
-        self._only_frame, self._tell, self._stops_at = only_frame, tell, stops_at
+        self._only_frame, self._tell, self._yields_errors = only_frame, tell, yields_errors
+        self._progress: Progress | None = None
         self._wanted = {files.number: files for files in wanted}
         self._timeline = plan.timeline(wanted)
         self._frames: dict[Key, ShotFrame] = {}
@@ -101,12 +102,12 @@ class ShotRun:
         for key in self._timeline.fusable(views[0].number):
             frame = self._frames[key]
             self._average_and_fuse(frame)
-            self._stop_at_error(frame)
+            if frame.error is not None and self._yields_errors:
+                yield frame
             self._timeline.fused(key)
             for number in self._timeline.settled():
                 first = self._frames[number, None]
                 self._settle(first)
-                self._stop_at_error(first)
                 yield first
                 del first  # or its pixels would be held while the next frame is fused
             self._release()
@@ -133,14 +134,12 @@ class ShotRun:
             frame.averaged = frame.read_if_small() if self._only_frame else frame.renders
             if frame.plan.reach.renders:
                 self._average_renders(frame)
-            frame.state = State.AVERAGED
             if self._tell is not None:
                 views = [view.hr for view in (*frame.others, frame)]
-                frame.progress = Progress(self._tell, costs_of(views, frame.session, frame.write))
+                self._progress = Progress(self._tell, costs_of(views, frame.session, frame.write))
             if frame.number in self._wanted:
                 self._fuse_others(frame)
             frame.fused = self.fuse(frame)
-            frame.state = State.FUSED
             if frame.plan.reach.results:
                 _keep(frame.fused)
         frame.seconds["fuse"] = time.perf_counter() - start
@@ -166,7 +165,7 @@ class ShotRun:
             needed = memory_to_fuse(alignment, first.session.contract, error=False) + first.held_bytes
             require_memory(needed, first.session.contract, self.settings.max_memory)
         for view in first.others:
-            view.session, view.memory, view.progress = first.session, first.memory, first.progress
+            view.session, view.memory = first.session, first.memory
             view.averaged = view.renders
             self._store_view(first, view, self.fuse(view))
 
@@ -192,7 +191,7 @@ class ShotRun:
             share=_share_by_spp(frame.lr, frame.hr),
             max_memory=self.settings.max_memory,
             held=frame.held_bytes,
-            progress=frame.progress,
+            progress=self._progress,
         )
         frame.averaged, fused.frames = RenderPair(*frame.stored), frame.frame_counts
         cache_bytes = strips_memory(self.settings.max_memory, frame.held_bytes)
@@ -200,11 +199,6 @@ class ShotRun:
             frame.renders, fused, frame.session, share=_share_by_spp(frame.lr, frame.hr), cache_bytes=cache_bytes
         )
         return fused
-
-    def _stop_at_error(self, frame: ShotFrame) -> None:
-        if self._stops_at is not None and frame.error is not None:
-            self._stops_at(frame.number)
-            raise frame.error
 
     def _settle(self, first: ShotFrame) -> None:
         """Average the fused views of a frame with those of its neighbours, and fuse what depends on the result."""
@@ -225,9 +219,7 @@ class ShotRun:
             if self.settings.strict and first.report.warnings:
                 raise InputError(f"not written, because warnings are errors: {'; '.join(first.report.warnings)}")
             busy = sum(frame.seconds["fuse"] for frame in views) + time.perf_counter() - start
-            network = first.report.network_seconds
-            first.report.seconds = {"read": first.seconds["read"], "fuse": busy, "network": network}
-            first.state = State.SETTLED
+            first.report.seconds = {"read": first.seconds["read"], "fuse": busy, **first.report.seconds}
 
     def _report(self, first: ShotFrame, picture: FusedFrame, others: Sequence[ShotFrame]) -> FrameReport:
         """Report on a frame that is settled: its first view with the final picture, and its other views."""
@@ -274,7 +266,7 @@ class ShotRun:
                 picture.replaced,
                 session=session,
                 cache_bytes=strips_memory(self.settings.max_memory - frame.held_bytes, picture.nbytes),
-                progress=frame.progress,
+                progress=self._progress,
             )
         picture.replaced = picture.passes.pixels
         session.release_layer_memory()
@@ -284,7 +276,7 @@ class ShotRun:
 
         def frame_of(number: int) -> tuple[MotionFrame, Any]:
             other = self._frames[number, frame.view]
-            if other.state < (State.FUSED if kind == "results" else State.READ):
+            if not other.was_read or (kind == "results" and other.fused is None):
                 assert other.error is not None
                 if isinstance(other.error, InputError):
                     raise other.error  # its files can't be used, so it is left out in every run
@@ -305,7 +297,7 @@ class ShotRun:
             if key not in renders | pictures:
                 del self._frames[key]
                 continue
-            if key not in renders and frame.state >= State.READ:
+            if key not in renders and frame.was_read:
                 frame.renders = RenderPair(*frame.stored)  # the files can still be read
             if key not in pictures:
                 frame.fused = None

@@ -329,9 +329,7 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
         f"{path} has {', '.join(sequence.pattern.name for sequence in sequences[:6])}"
         for path, sequences in ((lr, lows), (hr, highs))
     )
-    raise InputError(
-        f"which sequences belong together? {seen}; name the two as patterns, the low-resolution one first"
-    )
+    raise InputError(f"which sequences belong together? {seen}; name the two as patterns, the low-resolution one first")
 
 
 def _with_aovs(sequences: list[Sequence]) -> list[Sequence]:

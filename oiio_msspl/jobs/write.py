@@ -28,7 +28,7 @@ from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.image.parallel import in_background
 from oiio_msspl.jobs.existing import ExistingResults
-from oiio_msspl.jobs.frame import ShotFrame, State
+from oiio_msspl.jobs.frame import ShotFrame
 from oiio_msspl.jobs.report import provenance
 
 log = logging.getLogger(__name__)
@@ -102,7 +102,7 @@ def write_settled(frame: ShotFrame, existing: ExistingResults) -> None:
             if report.preview is not None and not report.output.exists():
                 report.preview.unlink(missing_ok=True)
             raise
-    frame.state, frame.picture = State.WRITTEN, None
+    frame.picture = None
     report.seconds["write"] = time.perf_counter() - start
     log.debug("report: %s", report.as_dict())
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import typer
 
+from msspl_cli import options
 from msspl_cli.commands import blender_install, check, compare, fuse, inspect, models, nuke_install, render, submit
 from msspl_cli.errors import run
-from oiio_msspl._version import full_version
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -28,21 +28,13 @@ app = typer.Typer(no_args_is_help=True, **_SETTINGS)
 
 
 @app.callback(invoke_without_command=True)
-def _main(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
+def _main(version: options.Version = False) -> None:
     """Inspect renders, list models and compare results. To fuse a pair, see [bold]msspl-fuse --help[/bold]."""
-    if version:
-        print(full_version())
-        raise typer.Exit
 
 
-app.command(epilog=inspect.EXAMPLES)(inspect.inspect)
-app.command(epilog=check.EXAMPLES)(check.check)
-app.command(epilog=models.EXAMPLES)(models.models)
-app.command(epilog=compare.EXAMPLES)(compare.compare)
-app.command(epilog=fuse.EXAMPLES)(fuse.fuse)
-app.command(epilog=submit.EXAMPLES)(submit.submit)
-app.command("blender-install", epilog=blender_install.EXAMPLES)(blender_install.blender_install)
-app.command("nuke-install", epilog=nuke_install.EXAMPLES)(nuke_install.nuke_install)
+for module in (inspect, check, models, compare, fuse, submit, blender_install, nuke_install):
+    name = module.__name__.rpartition(".")[2]
+    app.command(name.replace("_", "-"), epilog=module.EXAMPLES)(getattr(module, name))
 
 
 def msspl_fuse() -> None:

@@ -184,8 +184,6 @@ def _end(process: subprocess.Popen[str]) -> None:
             os.killpg(process.pid, end)
         else:
             process.send_signal(end)
-        try:
+        with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(_GRACE)
             return
-        except subprocess.TimeoutExpired:
-            continue

@@ -182,9 +182,7 @@ def common_windows(renders: Sequence[MappedRender], largest: MappedRender) -> li
 def _place(render: MappedRender, largest: MappedRender) -> _Place:
     """Place a render in the pixels of the largest one, or refuse its size."""
     data, display, whole, frame = render.data_window, render.display_window, largest.data_window, largest.display_window
-    if display == frame:
-        return _Place(1, 0, 0, data)
-    if (scale := _scale(display, frame)) and (data != display or whole != frame):
+    if (scale := _scale(display, frame)) and (display == frame or data != display or whole != frame):
         x0, y0 = frame.x0 - scale * display.x0, frame.y0 - scale * display.y0
         return _Place(scale, x0, y0, Window(*(scale * side for side in astuple(data))).shift(x0, y0))
     if scale := _scale(data, whole):

@@ -52,6 +52,8 @@ def compare(
     than the reference by x2, x4 or x8 are upsampled bicubically first. Of files
     with several views, the first view of the first image is compared.
     """
+    from oiio_msspl.aovs.features import RGB
+    from oiio_msspl.aovs.mapping import parse_map_options
     from oiio_msspl.compare import check_page, notes, open_comparison, score_images
     from oiio_msspl.compare_page import check_layers
     from oiio_msspl.image.arrays import HALF_MAX
@@ -62,7 +64,10 @@ def compare(
         raise InputError("--layers chooses the layers of the page; add --html PAGE")
     if html is not None:
         check_page(html, [*images, reference] if reference else images, overwrite=overwrite)
-    comparison = open_comparison(images, reference, _layer(mapping))
+    mapped = parse_map_options(mapping)
+    if mapped.keys() - {RGB}:
+        raise InputError("--map: only rgb is compared; write --map rgb=LAYER")
+    comparison = open_comparison(images, reference, mapped.get(RGB))
     if html is not None:
         check_layers(comparison, layers)
     for note in notes(comparison):
@@ -80,17 +85,6 @@ def compare(
         _print(images, results)
     if wrote:
         console.say(wrote, error=as_json)
-
-
-def _layer(mapping: list[str]) -> str | None:
-    """Return the layer that ``--map`` names; None for the beauty."""
-    from oiio_msspl.aovs.features import RGB
-    from oiio_msspl.aovs.mapping import parse_map_options
-
-    layers = parse_map_options(mapping)
-    if layers.keys() - {RGB}:
-        raise InputError("--map: only rgb is compared; write --map rgb=LAYER")
-    return layers.get(RGB)
 
 
 def _print(images: list[Path], results: list[dict[str, float]]) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,10 +19,6 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.image.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
-    from dask.distributed import Client
-
     from oiio_msspl.jobs.report import FrameReport
 
 #: LRHS, HRLS and output; None and the only render in front, if there is one.
@@ -195,15 +191,12 @@ def fuse(
 
 def _fuse_shot(files: Files, scheduler: str | None, printer: ShotPrinter, **settings: Any) -> None:
     """Fuse a shot, on a Dask cluster if ``--scheduler`` names one, and exit with its code."""
+    from oiio_msspl.jobs.farm.dask import connect
     from oiio_msspl.jobs.shot import fuse_shot
 
-    cluster: AbstractContextManager[Client | None] = nullcontext()
-    if scheduler is not None:
-        from oiio_msspl.jobs.farm.dask import connect
-
-        cluster = connect(scheduler)
     try:
-        with cluster as client:
+        with ExitStack() as stack:
+            client = None if scheduler is None else stack.enter_context(connect(scheduler))
             report = fuse_shot(*files, begin=printer.begin, progress=printer, client=client, **settings)
     finally:
         printer.end()

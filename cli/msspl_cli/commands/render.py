@@ -201,12 +201,12 @@ def _count_renders(renders: int | None, scale: int, lr_spp: int | None) -> int:
 
 def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Path]]:
     """Pair frame numbers with files. The number is None without ``frames``: the frame at which the scene was saved."""
-    from oiio_msspl.jobs.sequence import parse_frames, parse_pattern
+    from oiio_msspl.jobs.sequence import is_sequence, parse_frames, parse_pattern
 
     numbers = [] if frames is None else parse_frames(frames)
     if output.suffix.lower() != ".exr":
         raise InputError(f"{output}: the result is an EXR; name it .exr")
-    if _is_pattern(output):
+    if is_sequence(output) and not output.is_dir():
         if not numbers:
             raise InputError(f"{output}: is a pattern; name the frames with --frames")
         pattern = parse_pattern(output)
@@ -216,18 +216,12 @@ def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Pat
     return [(numbers[0] if numbers else None, output)]
 
 
-def _is_pattern(output: Path) -> bool:
-    from oiio_msspl.jobs.sequence import is_sequence
-
-    return is_sequence(output) and not output.is_dir()
-
-
 def _check_files(
     scene: Path, output: Path, targets: Sequence[Path], extras: Sequence[Path], *, overwrite: bool, skip_existing: bool
 ) -> None:
     """Refuse results, and extra files beside them, that can't be written."""
-    if _is_pattern(output) and not output.parent.exists():
-        atomic.check_folder(output.parent)  # the shot makes the folder
+    if not output.parent.exists():
+        atomic.check_folder(output.parent)  # which is made
     else:
         for path in targets:
             atomic.check_target(path, overwrite=overwrite)

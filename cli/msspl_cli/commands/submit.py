@@ -37,8 +37,6 @@ _TAKEN = {
 }
 #: Parameters of msspl-fuse that a job can't have: a task skips existing frames and reports to the farm.
 _LEFT_OUT = {"overwrite", "report_file", "progress", "as_json", "scheduler"}
-#: Options whose default differs from that of msspl-fuse: a farm has nobody to look at previews.
-_DEFAULTS = {"preview": False}
 
 
 def _with_options_of_fuse(command: Callable[..., None]) -> Callable[..., None]:
@@ -46,9 +44,10 @@ def _with_options_of_fuse(command: Callable[..., None]) -> Callable[..., None]:
     own, fuses = (inspect.signature(function, eval_str=True).parameters for function in (command, fuse.fuse))
     shared = [parameter for name, parameter in fuses.items() if name not in _LEFT_OUT]
     parameters = [
-        parameter.replace(kind=parameter.KEYWORD_ONLY, default=_DEFAULTS.get(parameter.name, parameter.default))
-        for parameter in [*shared, *own.values()]
-        if parameter.kind != parameter.VAR_KEYWORD
+        # A farm has nobody to look at previews.
+        each.replace(kind=each.KEYWORD_ONLY, default=False if each.name == "preview" else each.default)
+        for each in [*shared, *own.values()]
+        if each.kind != each.VAR_KEYWORD
     ]
 
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

@@ -64,8 +64,8 @@ class FrameReport:
     """Features of the HRLS that are read."""
     clipped: int = 0
     """Number of fused values that half could not hold; 0 if the beauty is stored as float."""
-    lrhs_aovs: tuple[str, ...] = ()
-    """Features that the model reads of an LRHS that has them, beside colour."""
+    lrhs_aovs: dict[str, str] = field(default_factory=dict)
+    """Features of the LRHS that the model reads beside colour, with their layers; none for one render."""
     passes: dict[str, str] = field(default_factory=dict)
     """A sentence on each additive set, by name: fused or passed on."""
     trust: float | None = None
@@ -108,11 +108,6 @@ class FrameReport:
         """Return the reports of all views that were fused, the first one in front; none for a file with one view."""
         return [self, *self.other_views] if self.hr.other_views else []
 
-    def found_lrhs_aovs(self) -> dict[str, str]:
-        """Return the features of ``lrhs_aovs`` that the LRHS has, with their layers."""
-        names = () if self.is_one_render else self.lrhs_aovs
-        return {name: self.lr.features[name].text for name in names if name in self.lr.features}
-
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values."""
         return {
@@ -132,7 +127,7 @@ class FrameReport:
             "provider": self.provider,
             "convolutions": self.convolutions,
             "aovs": self.aovs(),
-            "lrhs_aovs": self.found_lrhs_aovs(),
+            "lrhs_aovs": self.lrhs_aovs,
             "passes": self.passes,
             "layers": self.layers,
             "notes": self.hr.notes,
@@ -157,7 +152,9 @@ def report_on(
     if ALBEDO in session.contract.hrls and ALBEDO not in hr.features:
         text = "no albedo was found, so textures blur; render one, or name its layer with --map albedo=LAYER"
         warnings.insert(0, Finding("no_albedo", text))
-    read = hr.features_read(session.contract.hrls, alone=lr.file is hr.file and fused.trust is not None)
+    one_render = lr.file is hr.file
+    read = hr.features_read(session.contract.hrls, alone=one_render and fused.trust is not None)
+    lrhs_aovs = () if one_render else session.contract.lrhs[1:]
     return FrameReport(
         lr=lr,
         hr=hr.for_model(read),
@@ -174,7 +171,7 @@ def report_on(
         tiles=fused.tiles,
         seconds={"network": fused.seconds},
         features=frozenset(read),
-        lrhs_aovs=tuple(session.contract.lrhs[1:]),
+        lrhs_aovs={name: lr.features[name].text for name in lrhs_aovs if name in lr.features},
         passes=_passes(fused),
         trust=None if fused.trust is None else float(fused.trust.mean()),
         frames_counted=None if fused.frames is None else float(fused.frames.mean(dtype=np.float64)),

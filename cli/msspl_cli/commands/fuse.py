@@ -240,7 +240,7 @@ def _print(report: FrameReport, seconds: float) -> None:
         if any((row["feature"], row["status"]) == ("albedo", "default") for row in rows):
             read.append("albedo none: expect blur")
         console.say(f"  view {name_of(view.hr.view)}: {', '.join(read)}")
-    if lrhs_aovs := report.found_lrhs_aovs():
+    if lrhs_aovs := report.lrhs_aovs:
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
     for name, outcome in report.passes.items():
         console.say(f"  {name}: {outcome}")

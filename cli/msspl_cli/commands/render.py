@@ -220,8 +220,8 @@ def _check_files(
     scene: Path, output: Path, targets: Sequence[Path], extras: Sequence[Path], *, overwrite: bool, skip_existing: bool
 ) -> None:
     """Refuse results, and extra files beside them, that can't be written."""
-    if not output.parent.exists():
-        atomic.check_folder(output.parent)  # which is made
+    if output not in targets and not output.parent.exists():
+        atomic.check_folder(output.parent)  # a pattern's folder is made
     else:
         for path in targets:
             atomic.check_target(path, overwrite=overwrite)

@@ -66,7 +66,7 @@ class Inspection:
         """
         render = view or self.render
         assert render is not None and self.contract is not None
-        return render.table(self.contract.hrls)
+        return render.table(render.features_read(self.contract.hrls, alone=True))
 
     @property
     def layers(self) -> list[dict[str, str]]:
@@ -152,7 +152,8 @@ def inspect_file(
             raise InputError(f"{path}: is a pattern; name one of its files, and the next frame is found beside it")
         file = result.file = open_exr(path)
         result.facts = _facts(file)
-        render = result.render = map_hrls(file, inputs).for_model(contract.hrls)
+        render = map_hrls(file, inputs)
+        render = result.render = render.for_model(render.features_read(contract.hrls, alone=True))
         result.facts.append(_renderer_fact(render))
         result.facts += [*_pixel_facts(render), *_facts_of_sets(render)]
         for label in render.other_views if inputs.view is None else ():

@@ -96,9 +96,10 @@ class MappedRender:
     def features_read(self, read: Collection[str], *, alone: bool) -> list[str]:
         """Return the features that a model reads (``read``), and what else is read of a render that is fused alone.
 
-        That is the variance, if there is one: nothing else tells how much noise a pixel has.
+        That is the variance of colours, if there is one: nothing else tells how much noise a pixel has.
         """
-        return [*read, *([VARIANCE] if alone and VARIANCE in self.features and VARIANCE not in read else [])]
+        is_read = alone and VARIANCE in self.features and len(self.features[VARIANCE].terms[0]) == 3
+        return [*read, *([VARIANCE] if is_read and VARIANCE not in read else [])]
 
     def for_model(self, read: Collection[str]) -> MappedRender:
         """Return the render without the features that only the paper's network reads, and without notes about them.

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from oiio_msspl.aovs.features import ALBEDO, VARIANCE
+from oiio_msspl.aovs.features import ALBEDO
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.tiles.alignment import align
@@ -51,7 +51,7 @@ def advise(lr: MappedRender, hr: MappedRender, spread: bool | None, *, in_shot: 
             f"filter, the noise is removed all the same ({ours:.1f} dB at 2 spp, where OIDN reaches {oidn:.1f})"
         )
         advice.append(Finding("box_filter", text))
-    if lr is hr and VARIANCE not in hr.features:
+    if lr is hr and not hr.features_read((), alone=True):
         without, with_both = BOTH_SHOW
         text = (
             "render half of the samples with another seed, as a second file, or the variance of each pixel's mean as a "

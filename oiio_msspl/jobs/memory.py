@@ -73,7 +73,8 @@ def budget_view(
     result, vectors = result_bytes(alignment, error=error), _vector_bytes(hr, channels)
     # Frames whose pixels live: the one that is fused, its neighbours, and the next one to come.
     pixels = (2 * reach.renders + 2) * sum(_pixel_bytes(render, features) for render in (lr, hr))
-    waiting, averaging = memory_to_average(reach, hr.data_window, _channels(hr, features), alignment.scale)
+    averaged = _channels(hr, features) + (3 if lr is hr else 0)  # one render gets a variance by its frames
+    waiting, averaging = memory_to_average(reach, hr.data_window, averaged, alignment.scale)
     waiting += _waiting_means(lr, hr, reach)
     held = result + waiting + averaging + other_views
     room = max_memory - FIXED_MEMORY - TILE_MEMORY - _pixel_bytes(lr, features) - result - held

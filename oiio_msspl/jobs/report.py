@@ -70,7 +70,7 @@ class FrameReport:
     """A sentence on each additive set, by name: fused or passed on."""
     trust: float | None = None
     """Mean share of what the network had removed and was put back, because both renders show it, or because the only
-    render does by its variance; None without trust."""
+    render does, by the variance of its pixels or by its neighbours; None without trust."""
     frames_counted: float | None = None
     """How many frames a pixel is the mean of, in the mean over the first view; None without neighbours."""
     other_views: list[FrameReport] = field(default_factory=list)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, is_light_of_pass
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, VARIANCE, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError, explain
@@ -152,6 +152,8 @@ class ShotRun:
         lacking = any(lacking_passes(frame.renders, hop.frame) for hop in (*before, *after))
         passes = [] if lacking else light_features(frame.stored[1])
         features = [*features_read(frame.session), *passes]
+        if not frame.write.trust and VARIANCE in features:
+            features.remove(VARIANCE)
         lr, hr, frame.frame_counts = average_renders(frame.renders, before, after, features)
         frame.averaged = RenderPair(lr, hr)
         if passes:

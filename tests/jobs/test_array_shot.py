@@ -41,6 +41,20 @@ def test_neighbours_and_passes_of_arrays_are_fused(two):
         np.testing.assert_allclose(sum(fused.passes.values()), fused.rgb, atol=1e-5)
 
 
+def test_frames_of_one_render_keep_what_no_aov_shows():
+    """A light that is as fine as pixels: the network alone takes it for noise."""
+    rng = np.random.default_rng(2)
+    light = (0.5 * rng.uniform(0.4, 1.6, (96, 200, 1)) * np.ones(3)).astype(np.float32)
+    motion = np.tile(np.float32([-4, 0]), (96, 160, 1))
+    truth = [light[:, 4 * t : 4 * t + 160] for t in FRAMES]
+    frames = [
+        ArrayFrame(noisy(image, 32, t), albedo=np.full_like(image, 0.5), motion=motion) for t, image in enumerate(truth)
+    ]
+    alone, averaged = (list(fuse_array_shot(frames, temporal=over_time, quality="fast")) for over_time in ("off", 2))
+    errors = [np.square(shot[2].rgb - truth[2]).mean() for shot in (alone, averaged)]
+    assert errors[1] < 0.6 * np.square(frames[2].hr - truth[2]).mean() < 0.6 * errors[0]
+
+
 def test_arrays_that_do_not_fit_are_named():
     frame = rendered(0, two=False)
     wrong = {"key": frame.passes["key"][:-1], "fill": frame.passes["fill"]}

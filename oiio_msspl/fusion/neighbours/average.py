@@ -13,14 +13,14 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from oiio_msspl.aovs.features import RGB
+from oiio_msspl.aovs.features import RGB, VARIANCE
 from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.fusion.neighbours.bands import for_bands, rows_in_bands, whole_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
-from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS, Features, RenderBand, RenderPair, read
+from oiio_msspl.fusion.neighbours.renders import SQUARES, USUAL_CHANNELS, Features, RenderBand, RenderPair, read
 from oiio_msspl.fusion.neighbours.results import Images, ResultBand, images_of
 from oiio_msspl.fusion.neighbours.trust import WHOLE, Judge, Light, RenderLight, ResultLight, cells
 from oiio_msspl.image.arrays import Array, blank, unload
@@ -56,7 +56,8 @@ def average_renders(
     Args:
         pair: the frame.
         before, after: hops to the frames before and after it, the nearest first. All have the features of the frame.
-        features: which features the result has, if the renders have them; all if None.
+        features: which features the result has, if the renders have them; all if None. A ``variance`` that one render
+            lacks is found by how its frames differ.
 
     Returns:
         The LRHS, the HRLS (one render is both), and the number of frames with equal weight whose mean would have the
@@ -73,12 +74,16 @@ def average_renders(
         low = {name: values.copy() for name, values in read(pair.lr, alignment.lr_data_window, features).items()}
     row = read(pair.hr, Window(window.x0, window.y0, window.x1, window.y0 + 1), features)
     high: Features = {name: blank((window.height, window.width, values.shape[-1])) for name, values in row.items()}
+    if pair.is_one_render and VARIANCE not in high and VARIANCE in (features or ()):
+        high[SQUARES] = blank((window.height, window.width, 3))
 
     def band(core: Window, area: Window) -> RenderBand:
         return RenderBand(pair, light, low, high, core, area)
 
     weight = _weight(sum(image.shape[-1] for image in high.values()))
     frames = _average(light, before, after, band, lambda pair: pair.cells, weight)
+    if SQUARES in high:
+        high[VARIANCE] = high.pop(SQUARES)
     hr = _replaced(pair.hr, high, window)
     return hr if pair.is_one_render else _replaced(pair.lr, low, alignment.lr_data_window), hr, frames
 

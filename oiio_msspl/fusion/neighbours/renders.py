@@ -48,6 +48,9 @@ CLEAN = 0.08
 #: A neighbour's nearest pixel lies up to half a pixel beside the surface, where the albedo may differ. In clean renders
 #: that shows, so light is corrected by the ratio of the albedos up to this factor. ``DARK_ALBEDO`` is added to both.
 ANOTHER_ALBEDO, DARK_ALBEDO = np.float32(1.25), 0.01
+#: The mean of the squared colours of a render's frames, among its features. The frames of a pixel tell its variance if
+#: they count as this many.
+SQUARES, ENOUGH = "squares of rgb", 2.5
 #: The usual number of channels of a pair.
 USUAL_CHANNELS = 10
 
@@ -144,7 +147,8 @@ class RenderBand:
     Args:
         pair, light: the frame and its light.
         low: the LRHS's features over its data window; the rows of ``core`` are changed. None of one render.
-        high: gets the HRLS's features over the rows of ``core`` of its data window.
+        high: gets the HRLS's features over the rows of ``core`` of its data window, and the variance of its colour if
+            it has ``SQUARES``.
         core, area: see :func:`oiio_msspl.fusion.neighbours.bands.for_bands`.
     """
 
@@ -152,12 +156,14 @@ class RenderBand:
         self, pair: RenderPair, light: Light, low: Features, high: Features, core: Window, area: Window
     ) -> None:
         self._pair, self._light, self._area = pair, light, area
-        self._names, self._low_names = list(high), list(low)
+        self._names, self._low_names = [name for name in high if name != SQUARES], list(low)
         self._alignment = alignment = pair.alignment
         self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
         self._high_images = {name: image[core.slices(alignment.hr_data_window)] for name, image in high.items()}
         for name, values in read(pair.hr, core, self._names).items():
             self._high_images[name][:] = values
+        if SQUARES in high:
+            self._high_images[SQUARES][:] = np.square(self._high_images[RGB])
         # Half of the noise of the mean of both renders is that of the HRLS.
         clean = 2 * light.noise * alignment.scale**2 < CLEAN and pair.has_clean_aovs
         own = (ALBEDO, NORMAL) if clean else ()
@@ -200,6 +206,8 @@ class RenderBand:
         top = self._rows.start
 
         def pixels(name: str, rows: slice) -> Array:
+            if name == SQUARES:
+                return np.square(pixels(RGB, rows))
             inside = slice(top + rows.start, top + rows.stop)
             values = colours[inside] if name == RGB else high(name, inside)
             if name != RGB or self._albedo is None or path.nearest is None:
@@ -217,6 +225,10 @@ class RenderBand:
         if self._low is not None:
             self._low.divide()
         frames = self._high.divide()
+        if SQUARES in self._high_images:
+            squares, square = self._high_images[SQUARES], np.square(self._high_images[RGB])
+            scatter = np.maximum(squares - square, 0) / np.maximum(frames - 1, 1)
+            squares[:] = np.where(frames >= ENOUGH, scatter, square)
         for image in self._high_images.values():
             unload(image)
         self._pair.unload()

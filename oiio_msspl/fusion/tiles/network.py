@@ -170,7 +170,7 @@ def _fuse_alpha(tile: TileFeatures, session: Session, shares: Shares, *, trust: 
 
 def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shares, reach: int) -> Array:
     """Return the picture of a tile with the detail and the light that both renders show."""
-    if result.trust is None or tile.noise_free:
+    if result.trust is None or tile.noise_free or (RGB not in shares and tile.variance is None):
         return fused
     assert tile.lrhs is not None and tile.hrls is not None
     lrhs, hrls, share = tile.lrhs[RGB], tile.hrls[RGB], shares.get(RGB, 0.5)

@@ -51,6 +51,20 @@ def test_four_still_neighbours_halve_the_noise_of_both_renders():
     assert np.median(result.frames) > 4
 
 
+def test_the_frames_of_one_render_tell_its_variance():
+    truth, renders = texture(), []
+    for seed in range(5):
+        noise = 1 + np.random.default_rng(seed).normal(0, NOISE, truth.shape)
+        renders.append(Render.from_arrays("hr", rgb=(truth * noise).astype(np.float32), albedo=truth.copy()))
+    pairs = [RenderPair(render, render) for render in renders]
+    before, after = [still(pairs[1]), still(pairs[0])], [still(pairs[3]), still(pairs[4])]
+    _, averaged, frames = average(pairs[2], before, after, ["rgb", "albedo", "variance"])
+    many = frames[..., 0] > 4
+    expected = np.square(NOISE * truth) / frames
+    assert averaged.layers["variance"][many].mean() == pytest.approx(expected[many].mean(), rel=0.1)
+    assert "variance" not in average(pairs[2], before, after, ["rgb", "albedo"])[1].layers
+
+
 def test_neighbours_are_found_where_their_surfaces_are():
     pairs = {n: pair_of(texture(4 * n), n + 5) for n in (-2, -1, 0, 1, 2)}
     before, after = ([moved(pairs[n], 4 * np.sign(n)) for n in numbers] for numbers in ((-1, -2), (1, 2)))

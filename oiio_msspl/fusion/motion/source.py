@@ -19,6 +19,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender, ReadableRender
 from oiio_msspl.aovs.motion import MotionField, MotionFormat, user_fields
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.motion.camera import Projection, camera_vectors, find_projection
 from oiio_msspl.fusion.motion.flow import flow_vectors, has_optical_flow
 from oiio_msspl.fusion.motion.formats import FEWEST, MARGIN, FieldCheck, check_field, is_silent
@@ -137,7 +138,9 @@ class MotionSource:
         """Return the features of two frames, and the names of those that a surface keeps."""
         frames, moves = (frame, neighbour), self.kind != STATIC
         names = [name for name in (ALBEDO, NORMAL) if all(has_guide(f.hr, name, moves=moves) for f in frames)]
-        return frame.pixels or frame.hr, neighbour.pixels or neighbour.hr, names
+        here, there = (f.pixels or f.hr for f in frames)
+        averaged = [render for render in (here, there) if isinstance(render, Render)]
+        return here, there, [name for name in names if all(name in render.layers for render in averaged)]
 
     def tells_more(self, hr: MappedRender) -> bool:
         """Return whether something moves in a frame along an axis that is :attr:`silent`.

@@ -36,7 +36,7 @@ def write_single_part(path: Path, contents: FileContents) -> None:
         with OpenEXR.File(header, channels) as file:
             file.write(str(path))
     except Exception as error:
-        raise OSError(str(error)) from error
+        raise OSError(f"{error}; is the disk full?") from error
 
 
 def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:

@@ -22,7 +22,7 @@ from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.writer import bytes_held
-from oiio_msspl.findings import Finding
+from oiio_msspl.findings import Finding, codes_of
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
 from oiio_msspl.fusion.motion.shot import ShotMotion
 from oiio_msspl.fusion.motion.source import MotionFrame
@@ -152,7 +152,7 @@ class ShotRun:
         lacking = any(lacking_passes(frame.renders, hop.frame) for hop in (*before, *after))
         passes = [] if lacking else light_features(frame.stored[1])
         features = [*features_read(frame.session), *passes]
-        if not frame.write.trust and VARIANCE in features:
+        if VARIANCE in features and (not frame.write.trust or "same_seed" in codes_of(frame.warnings)):
             features.remove(VARIANCE)
         lr, hr, frame.frame_counts = average_renders(frame.renders, before, after, features)
         frame.averaged = RenderPair(lr, hr)

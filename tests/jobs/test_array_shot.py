@@ -55,6 +55,20 @@ def test_frames_of_one_render_keep_what_no_aov_shows():
     assert errors[1] < 0.6 * np.square(frames[2].hr - truth[2]).mean() < 0.6 * errors[0]
 
 
+@pytest.mark.parametrize("dimmer", [0.0, 0.01])
+def test_frames_of_one_seed_tell_no_noise(dimmer):
+    """They are equal, or differ by their light alone, although each has noise."""
+    albedo = np.full((96, 160, 3), 0.5, np.float32)
+    albedo[:, ::2] = 0.6
+    albedo[:40] = 0.3
+    wall = np.full_like(albedo, 0.5)
+    frames = [ArrayFrame(noisy(wall, 16, 0) * np.float32(1 - dimmer * t), albedo=albedo) for t in FRAMES]
+    alone, averaged = (list(fuse_array_shot(frames, temporal=over_time, quality="fast")) for over_time in ("off", 2))
+    assert "same_seed" in {warning.code for warning in averaged[2].warnings}
+    errors = [np.abs(shot[2].rgb - wall * np.float32(1 - 2 * dimmer)).mean() for shot in (alone, averaged)]
+    assert errors[1] < 1.05 * errors[0]
+
+
 def test_arrays_that_do_not_fit_are_named():
     frame = rendered(0, two=False)
     wrong = {"key": frame.passes["key"][:-1], "fill": frame.passes["fill"]}

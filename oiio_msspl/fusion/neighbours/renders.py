@@ -49,8 +49,8 @@ CLEAN = 0.08
 #: that shows, so light is corrected by the ratio of the albedos up to this factor. ``DARK_ALBEDO`` is added to both.
 ANOTHER_ALBEDO, DARK_ALBEDO = np.float32(1.25), 0.01
 #: The mean of the squared colours of a render's frames, among its features. The frames of a pixel tell its variance if
-#: they count as this many.
-SQUARES, ENOUGH = "squares of rgb", 2.5
+#: they count as this many, and scatter by more than this, relative to the square of the colour.
+SQUARES, ENOUGH, EQUAL = "squares of rgb", 2.5, np.float32(1e-6)
 #: The usual number of channels of a pair.
 USUAL_CHANNELS = 10
 
@@ -227,8 +227,10 @@ class RenderBand:
         frames = self._high.divide()
         if SQUARES in self._high_images:
             squares, square = self._high_images[SQUARES], np.square(self._high_images[RGB])
-            scatter = np.maximum(squares - square, 0) / np.maximum(frames - 1, 1)
-            squares[:] = np.where(frames >= ENOUGH, scatter, square)
+            scatter = np.maximum(squares - square, 0)
+            # Frames of one seed are equal, although each has noise.
+            known = (frames >= ENOUGH) & (scatter > EQUAL * square)
+            squares[:] = np.where(known, scatter / np.maximum(frames - 1, 1), square)
         for image in self._high_images.values():
             unload(image)
         self._pair.unload()

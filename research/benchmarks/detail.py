@@ -4,8 +4,9 @@
     python -m research.benchmarks.detail --table research/benchmarks/results/detail.csv
 
 Scenes have an exact reference (:mod:`research.benchmarks.stability.analytic`). Their light has structure, and albedo
-and normal do not. Each quality takes the model for the noise of the pair. PSNR is that of the pictures in sRGB, which
-clips at 1. ``light`` is the mean of the picture as a share of the reference's, which does not.
+and normal do not. Each quality takes the model for the noise of the pair. "One render" has the samples of both. PSNR is
+that of the pictures in sRGB, which clips at 1. ``light`` is the mean of the picture as a share of the reference's,
+which does not.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ SAMPLES = ((4, 1), (16, 4), (64, 16), (256, 64))
 #: Columns that tell rows apart.
 KEYS = ("case", "spp", "method")
 NETWORK_ALONE = ", network alone"
+ONE, WITH_VARIANCE = "one render", ", with its variance"
 
 Y, X = np.mgrid[: SIDE * SUB, : SIDE * SUB].astype(np.float32) / SUB
 SHAPE = X.shape
@@ -136,6 +138,12 @@ def measure(case: str, samples: tuple[int, int]) -> Iterator[Row]:
         for method, trust in ((quality, True), (quality + NETWORK_ALONE, False)):
             models[method] = {"model": session.name}
             pictures[method] = partial(lambda session, trust: fuse(low, high, session, trust=trust).rgb, session, trust)
+    one = render(scene, low_spp // SCALE**2 + high_spp, rng)
+    pictures[ONE] = lambda: one.layers["rgb"]
+    single = load_model(1, family_for_noise(QUALITIES["best"], one, one, align(one, one))[0])
+    for method, trust in ((f"best, {ONE}", False), (f"best, {ONE}{WITH_VARIANCE}", True)):
+        models[method] = {"model": single.name}
+        pictures[method] = partial(lambda trust: fuse(one, one, single, trust=trust).rgb, trust)
     for method, picture in pictures.items():
         image = picture()
         score = scores(image, truth)

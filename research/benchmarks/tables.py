@@ -153,6 +153,14 @@ DETAIL = Table(
             f"best{detail.NETWORK_ALONE}": "`best`, network alone",
             "best": "`best`",
         }.items()
+    ]
+    + [
+        Column(f"one render of 128 spp: {title}", "psnr", {"spp": "256-64", "method": method}, form="{:.1f}")
+        for method, title in {
+            detail.ONE: "render",
+            f"best, {detail.ONE}": "`best`",
+            f"best, {detail.ONE}{detail.WITH_VARIANCE}": "`best`, with its variance",
+        }.items()
     ],
 )
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from oiio_msspl.exr.render import Render
 from oiio_msspl.image.arrays import Array
-from oiio_msspl.image.colour import luminance
 
 #: Points a pixel along each axis.
 SUB = 4
@@ -105,15 +104,14 @@ def render(
     height, width = (n // (SUB * scale) for n in scene.back.shape[:2])
     corners = np.mgrid[0:height, 0:width] * (SUB * scale)
     total: dict[str, NDArray[np.float64]] = {}
-    squares = np.zeros((height, width, 1))
+    squares = np.zeros((height, width, 3))
     for _ in range(spp):
         sample = _sample(scene, footprint, corners, rng)
         for name, values in sample.items():
             total[name] = total.get(name, 0.0) + values / spp
-        squares += np.square(luminance(sample["rgb"]))[..., None] / spp
+        squares += np.square(sample["rgb"]) / spp
     if spp > 1:
-        variance = squares - np.square(luminance(total["rgb"].astype(np.float32)))[..., None]
-        total["variance"] = np.maximum(variance, 0) / (spp - 1)
+        total["variance"] = np.maximum(squares - np.square(total["rgb"]), 0) / (spp - 1)
     layers = {name: values.astype(np.float32) for name, values in total.items()}
     return Render.from_arrays("HRLS" if scale == 1 else "LRHS", **layers)
 

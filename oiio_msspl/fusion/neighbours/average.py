@@ -56,8 +56,8 @@ def average_renders(
     Args:
         pair: the frame.
         before, after: hops to the frames before and after it, the nearest first. All have the features of the frame.
-        features: which features the result has, if the renders have them; all if None. A ``variance`` that one render
-            lacks is found by how its frames differ.
+        features: which features the result has, if the renders have them; all if None. A ``variance`` of colours that
+            one render lacks is found by how its frames differ.
 
     Returns:
         The LRHS, the HRLS (one render is both), and the number of frames with equal weight whose mean would have the
@@ -74,7 +74,8 @@ def average_renders(
         low = {name: values.copy() for name, values in read(pair.lr, alignment.lr_data_window, features).items()}
     row = read(pair.hr, Window(window.x0, window.y0, window.x1, window.y0 + 1), features)
     high: Features = {name: blank((window.height, window.width, values.shape[-1])) for name, values in row.items()}
-    if pair.is_one_render and VARIANCE not in high and VARIANCE in (features or ()):
+    of_colours = VARIANCE in high and high[VARIANCE].shape[-1] == 3
+    if pair.is_one_render and not of_colours and VARIANCE in (features or ()):
         high[SQUARES] = blank((window.height, window.width, 3))
 
     def band(core: Window, area: Window) -> RenderBand:

@@ -102,7 +102,7 @@ class FramePair:
     def tells_noise(self) -> bool:
         """Whether two renders tell the noise of a pixel by their difference, or one by its variance.
 
-        A variance of luminance tells nothing of colours, and one that is 0 everywhere is that of single samples.
+        A variance that is 0 everywhere is that of single samples.
 
         Raises:
             InputError: pixels can't be decoded.
@@ -110,12 +110,14 @@ class FramePair:
         if not self._is_one_render:
             return True
         shares = []
-        for band in sample_bands(self._alignment.grid, ONE_SIZE) if self._reads_variance else []:
+        for band in sample_bands(self._alignment.grid, ONE_SIZE):
             render = self._read(Tile(band, band), [RGB, VARIANCE]).hrls
-            if VARIANCE in render and render[VARIANCE].shape[-1] == 3:
-                least = np.float32(ROUNDING) * np.square(render[RGB]).max(axis=-1, keepdims=True)
-                shares.append(float((render[VARIANCE] > least).mean()))
-        return bool(shares) and float(np.mean(shares)) > KNOWN
+            variance = _variance_of_colours(render)
+            if variance is None:
+                return False
+            least = np.float32(ROUNDING) * np.square(render[RGB]).max(axis=-1, keepdims=True)
+            shares.append(float((variance > least).mean()))
+        return float(np.mean(shares)) > KNOWN
 
     def counts(self, kind: str) -> dict[str, int]:
         """Return the numbers of values that were ``repaired`` or ``negative``, by render and feature (``lrhs.rgb``)."""
@@ -136,7 +138,7 @@ class FramePair:
         aovs = tuple(name for name in self._aovs if name in features.hrls)
         prepared = PreparedTile(replace(features, hrls=guides), empty, aovs=aovs)
         if self._reads_variance:
-            prepared.variance = features.hrls.get(VARIANCE)
+            prepared.variance = _variance_of_colours(features.hrls)
         # An empty tile may still show surfaces.
         if empty is None or not empty.all() or self._aovs:
             lrhs_rgb, prepared.hrls = dim_fireflies(features)
@@ -194,6 +196,12 @@ class FramePair:
             return None
         whole = Window(high.x0 // scale, high.y0 // scale, -(-high.x1 // scale), -(-high.y1 // scale))
         return low.union(whole).intersect(self.grid)
+
+
+def _variance_of_colours(hrls: Images) -> Array | None:
+    """Return the variance of a render (h, w, 3); None if it has none, or one of luminance, which tells no colours."""
+    variance = hrls.get(VARIANCE)
+    return variance if variance is not None and variance.shape[-1] == 3 else None
 
 
 def alpha_as_colour(render: Images) -> Images:

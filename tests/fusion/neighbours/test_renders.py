@@ -51,11 +51,14 @@ def test_four_still_neighbours_halve_the_noise_of_both_renders():
     assert np.median(result.frames) > 4
 
 
-def test_the_frames_of_one_render_tell_its_variance():
+@pytest.mark.parametrize("own", [{}, {"variance": np.zeros((*texture().shape[:2], 1), np.float32)}])
+def test_the_frames_of_one_render_tell_its_variance(own):
+    """Also if it has one of luminance, which says nothing of colours."""
     truth, renders = texture(), []
     for seed in range(5):
         noise = 1 + np.random.default_rng(seed).normal(0, NOISE, truth.shape)
-        renders.append(Render.from_arrays("hr", rgb=(truth * noise).astype(np.float32), albedo=truth.copy()))
+        layers = {"rgb": (truth * noise).astype(np.float32), "albedo": truth.copy()} | own
+        renders.append(Render.from_arrays("hr", **layers))
     pairs = [RenderPair(render, render) for render in renders]
     before, after = [still(pairs[1]), still(pairs[0])], [still(pairs[3]), still(pairs[4])]
     _, averaged, frames = average(pairs[2], before, after, ["rgb", "albedo", "variance"])

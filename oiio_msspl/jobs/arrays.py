@@ -142,7 +142,8 @@ def fuse_array_shot(
 
     Raises:
         ValueError: an array has another shape than it must have, or no floats.
-        InputError: the arrays of a frame do not fit together, or an option is wrong.
+        InputError: the arrays of a frame do not fit together, or an option is wrong. ``hr.0002.exr`` is ``hr`` of the
+            second frame.
         MssplError: the network failed, or the disk has no room.
     """
     with tempfile.TemporaryDirectory(prefix="msspl-") as name:
@@ -185,12 +186,12 @@ def _write(path: Path, rgb: Array, aovs: Mapping[str, Array | None], layers: Map
     render = Render.from_arrays(path.name, rgb=rgb, **features)
     planes: dict[str, Array] = {}
     for name, image in (render.layers | {key: np.asarray(value) for key, value in layers.items()}).items():
+        if name in layers and (name in render.layers or re.fullmatch(r"[\w-]+", name) is None):
+            raise InputError(f"{path.name}: pass {name!r}: give it a name of its own, of letters, digits, _ and -")
         channels = _channels_of(name)
-        if image.shape != (*rgb.shape[:2], len(channels)):
-            expected = (*rgb.shape[:2], len(channels))
+        expected = (*rgb.shape[:2], len(channels))
+        if image.shape != expected:
             raise InputError(f"{path.name}: {name} has the shape {image.shape}, and not {expected}")
-        if re.fullmatch(r"[\w-]+", name) is None:
-            raise InputError(f"{path.name}: pass {name!r}: name it with letters, digits, _ and -")
         planes |= zip(channels, planes_of(image).astype(np.float32, copy=False), strict=True)
     path.parent.mkdir(exist_ok=True)
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}

@@ -56,8 +56,8 @@ def average_renders(
     Args:
         pair: the frame.
         before, after: hops to the frames before and after it, the nearest first. All have the features of the frame.
-        features: which features the result has, if the renders have them; all if None. A ``variance`` of colours that
-            one render lacks is found by how its frames differ.
+        features: which features the result has, if the renders have them; all if None. If one render lacks a
+            ``variance`` of colours, its frames tell it.
 
     Returns:
         The LRHS, the HRLS (one render is both), and the number of frames with equal weight whose mean would have the

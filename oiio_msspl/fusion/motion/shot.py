@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,9 +65,10 @@ class ShotMotion:
             raise InputError(f"motion vectors between frames {numbers[0]} and {numbers[1]} {ways}")
         return ways if first is here else ways[::-1]
 
-    def keep(self, numbers: Collection[int]) -> None:
-        """Forget the motion of all frames but these."""
-        self._motions = {pair: ways for pair, ways in self._motions.items() if set(pair) <= set(numbers)}
+    def forget(self, number: int) -> None:
+        """Forget the motion from and to a frame."""
+        for numbers in [numbers for numbers in list(self._motions) if number in numbers]:
+            del self._motions[numbers]
 
     def _read(self, first: MotionFrame, second: MotionFrame) -> tuple[Motion, Motion] | str:
         """Read the motion between two frames, forwards and backwards; or what is wrong with it."""

@@ -15,7 +15,7 @@ import numpy as np
 from oiio_msspl.aovs.features import NORMAL
 from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.exr.render import Window
-from oiio_msspl.image.arrays import Array, Mask, planes_of
+from oiio_msspl.image.arrays import Array, Mask, all_finite, planes_of
 from oiio_msspl.image.filters import grown, means_around, sum_3x3
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices
@@ -120,10 +120,7 @@ def _means_at(image: Array, x: Array, y: Array) -> Array:
 
 def _finite(values: Array) -> Array:
     """Return values with 0 in place of NaN and infinities."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        if np.isfinite(values.sum()):  # ten times as fast as a test of each
-            return values
-    return np.where(np.isfinite(values), values, np.float32(0))
+    return values if all_finite(values) else np.where(np.isfinite(values), values, np.float32(0))
 
 
 def _differ(

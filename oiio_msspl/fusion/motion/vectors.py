@@ -95,7 +95,7 @@ def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask
     """Find where a vector of 0 may mean that the renderer knows none."""
     # Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of
     # the surfaces do not move either.
-    still = known & (np.abs(vectors) < NO_MOTION).all(axis=-1)
+    still = known & (np.abs(vectors[..., 0]) < NO_MOTION) & (np.abs(vectors[..., 1]) < NO_MOTION)
     normal = pixels.read(pixels.data_window, [NORMAL]).get(NORMAL) if still.any() else None
     surface = known if normal is None else known & (normal != 0).any(axis=-1)
     count = np.count_nonzero(surface)
@@ -111,8 +111,9 @@ def _uneven(vectors: Array) -> Mask:
     for turned, uneven in ((motion, result), (motion.T, result.T)):
         with np.errstate(all="ignore"):  # vectors that are not believed may have any values
             changes = np.diff(turned, axis=0)
-            fast = np.abs(changes) > UNEVEN
-            uneven[1:-1] |= fast[1:] & fast[:-1] & ((changes[1:] * changes[:-1].conj()).real > 0)
+            fast = np.square(changes.real) + np.square(changes.imag) > UNEVEN**2
+            places = np.nonzero(fast[1:] & fast[:-1])
+            uneven[1:-1][places] |= (changes[1:][places] * changes[:-1][places].conj()).real > 0
     return result
 
 

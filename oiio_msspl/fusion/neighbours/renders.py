@@ -25,7 +25,7 @@ from oiio_msspl.fusion.neighbours.trust import WHOLE, Judge, Light, cells, liken
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import read_lrhs
-from oiio_msspl.image.arrays import Array, Mask, repair, unload
+from oiio_msspl.image.arrays import Array, Mask, all_finite, repair, unload
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.filters import columns_apart, even_and_odd, grown, interpolate, means_around
 from oiio_msspl.image.sampling import nearest_indices, sample_cubic
@@ -101,9 +101,23 @@ class RenderPair:
         return bool(is_noise_spread(self.hr, self.hr, self.alignment))
 
     @cached_property
+    def noise_signs(self) -> NDArray[np.int8]:
+        """The signs (h, w) of the noise over the alignment's grid: of LRHS - HRLS."""
+        return np.sign(np.subtract(*map(luminance, self.colours))).astype(np.int8)
+
+    @cached_property
+    def may_be_broken(self) -> bool:
+        """Whether a pixel of the HRLS may be NaN or infinite; True for one that is read from a file."""
+        return not isinstance(self.hr, Render) or not all(map(all_finite, self.hr.layers.values()))
+
+    @cached_property
     def has_clean_aovs(self) -> bool:
         """Whether albedo and normal need no average: where the HRLS has moved, that would only blur them."""
         return has_clean_aovs(self.hr, self.alignment)
+
+    def prepare(self) -> None:
+        """Compute what each average with a neighbour needs."""
+        _ = self.cells, self.noise_signs, self.may_be_broken
 
     def unload(self) -> None:
         """Give the memory of pixels that wait in temporary files back to the system."""
@@ -123,8 +137,7 @@ def shared_noise(frame: RenderPair, neighbour: RenderPair) -> float:
     """
     if frame.alignment.grid != neighbour.alignment.grid:
         return 0.0
-    first, second = (np.sign(np.subtract(*map(luminance, pair.colours))) for pair in (frame, neighbour))
-    alike = first * second
+    alike = frame.noise_signs * neighbour.noise_signs
     count = np.count_nonzero(alike)
     return float(alike.sum(dtype=np.float64) / count) if count else 0.0
 
@@ -172,6 +185,7 @@ class RenderBand:
         #: The grid pixels of the area, and those of ``core`` that the LRHS has: it may lack a row or a column.
         self._grid = grid_window(alignment, area)
         self._colours = [colours[self._grid.slices(alignment.grid)] for colours in pair.colours]
+        self._luminance = luminance(self._colours[0])
         #: What a neighbour's HRLS that is hidden is taken for: of one render, both colours are a part of it.
         self._mean_colours = sum(self._colours) / np.float32(2) if pair.is_one_render else self._colours[1]
         self._low_place = grid_window(alignment, core).intersect(alignment.lr_data_window)
@@ -182,11 +196,11 @@ class RenderBand:
     def add(self, hop: Hop[RenderPair], path: Path, judge: Judge) -> None:
         """Add the renders of a neighbour that a path leads to."""
         neighbour, alignment, area = hop.frame, self._alignment, self._area
-        high, finite = _nearest(neighbour, path, self._names)
-        valid = finite & path.valid
-        share = to_grid(alignment, valid.astype(np.float32), area)
+        high, valid = _nearest(neighbour, path, self._names)
+        shown = valid.astype(np.float32)
+        share = to_grid(alignment, shown, area)
         colours = high(RGB, slice(None))
-        hrls = to_grid(alignment, _bounded(colours) * valid[..., None], area)
+        hrls = to_grid(alignment, _bounded(colours) * shown[..., None], area)
         hrls = np.where(share[..., None] >= COVERED, hrls / np.maximum(share, 1e-6)[..., None], self._mean_colours)
         if self._low is None:
             lrhs, hrls = self._pair.halves(hrls)
@@ -199,10 +213,9 @@ class RenderBand:
             counted = counted * self._light.moved_weight
         if path.moved_objects is not None:
             counted = counted * self._far_from(path.moved_objects)
-        own, other = (luminance(colours) for colours in (self._colours[0], lrhs))
-        bright = likeness(own, other, self._light.darkest, OTHER_BRIGHTNESS, steep=True)
+        bright = likeness(self._luminance, luminance(lrhs), self._light.darkest, OTHER_BRIGHTNESS, steep=True)
         counted = counted * np.where(grown(share < 1, 2), BESIDE_HIDDEN * bright, np.float32(1))
-        weight = from_grid(alignment, counted, area) * valid
+        weight = from_grid(alignment, counted, area) * shown
         top = self._rows.start
 
         def pixels(name: str, rows: slice) -> Array:
@@ -298,19 +311,21 @@ def _nearest(neighbour: RenderPair, path: Path, names: Sequence[str]) -> tuple[C
 
     Returns:
         A function of a feature and rows to its pixels (n, w, c), not to be changed: 0 where they are not finite; and
-        where all features are finite, (h, w), if the path is valid there.
+        where the path is valid and all features are finite, (h, w).
     """
-    window, nearest = neighbour.alignment.hr_data_window, path.nearest
+    window, nearest, valid = neighbour.alignment.hr_data_window, path.nearest, path.valid
     place = path.place_in(window)
-    images = _with_finite_passes(read(neighbour.hr, place, names))
-    finite = _make_finite(images)
-    if nearest is None:
-        return lambda name, rows: images[name][rows], finite
-    planes = {name: _flat_planes(image) for name, image in images.items()}
-    # Copies of all indices take memory, and broken pixels are rare.
     first = (place.y0 - window.y0) * window.width
-    finite = path.valid if finite.all() else finite.take(nearest - first)
-    return lambda name, rows: _take(planes[name], nearest[rows] - first), finite
+    images = read(neighbour.hr, place, names)
+    if neighbour.may_be_broken:
+        images = _with_finite_passes(images)
+        finite = _make_finite(images)
+        if not finite.all():  # copies of all indices take memory
+            valid = valid & (finite if nearest is None else finite.take(nearest - first))
+    if nearest is None:
+        return lambda name, rows: images[name][rows], valid
+    planes = {name: _flat_planes(image) for name, image in images.items()}
+    return lambda name, rows: _take(planes[name], nearest[rows] - first), valid
 
 
 def _ratio(own: Array, other: Array) -> Array:
@@ -341,11 +356,9 @@ def _with_finite_passes(features: Features) -> Features:
 def _make_finite(features: Features) -> Mask:
     """Return where all features are finite, (h, w), and set other pixels to 0."""
     finite = np.ones(next(iter(features.values())).shape[:2], bool)
-    # An image is summed up ten times as fast as its pixels are tested. The sum of finite pixels may overflow.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for values in features.values():
-            if not np.isfinite(values.sum()):
-                finite &= np.isfinite(values).all(axis=-1)
+    for values in features.values():
+        if not all_finite(values):
+            finite &= np.isfinite(values).all(axis=-1)
     if not finite.all():
         for name, values in features.items():
             features[name] = np.where(finite[..., None], values, np.float32(0))

@@ -51,9 +51,12 @@ def test_two_frames_are_read_once_and_in_one_order():
     assert forth.known is None and forth.tolerance == ROUND_TRIP
     assert motion.between(frame(4), frame(5)) == (forth, back)
     assert len(source.reads) == 2
-    motion.keep({5, 6})
-    motion.between(frame(4), frame(5))
+    motion.between(frame(5), frame(6))
+    motion.forget(4)
+    motion.between(frame(5), frame(6))
     assert len(source.reads) == 4
+    motion.between(frame(4), frame(5))
+    assert len(source.reads) == 6
 
 
 def test_vectors_of_flow_may_miss_by_more():

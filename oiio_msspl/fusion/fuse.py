@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -20,12 +20,12 @@ from oiio_msspl.fusion.checks.averages import HrlsAverages, bounded_luminance
 from oiio_msspl.fusion.checks.pair import Judgement, check_pair
 from oiio_msspl.fusion.passes.fuse import FusedPasses
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
+from oiio_msspl.fusion.tiles.network import FusedPixels, TileTask, fuse_tiles, tile_tasks
 from oiio_msspl.fusion.tiles.prepare import FramePair
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, memory_to_fuse, require_memory, strips_memory
 from oiio_msspl.image.arrays import Array, blank, unload
 from oiio_msspl.image.filters import columns_apart, even_and_odd
-from oiio_msspl.image.parallel import limit_threads
+from oiio_msspl.image.parallel import in_background, limit_threads
 from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.session import Session
@@ -113,8 +113,23 @@ def fuse(
         frame = FusedFrame(rgb, None, errors, alignment, pair.exposure, {})
         if trust and session.contract.denoiser and pair.tells_noise:
             frame.trust = blank((alignment.grid.height, alignment.grid.width), on_disk=False)
+
+        def judge() -> Judgement:
+            if lr is hr:
+                return Judgement()
+            return check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
+
+        judged = judge
+
+        def tasks() -> Iterator[TileTask]:
+            nonlocal judged
+            for task in tile_tasks(pair, frame):
+                if task.count == 1:  # all is read, so the pair is judged while the network works
+                    judged = in_background(judge)
+                yield task
+
         with hr.cache_strips(strips_memory(max_memory, held)):
-            for task in fuse_tiles(tile_tasks(pair, frame), session):
+            for task in fuse_tiles(tasks(), session):
                 frame.tiles = task.count
                 for image in frame.clean_aovs.values():
                     unload(image)
@@ -125,27 +140,31 @@ def fuse(
                 del task  # or its memory would be held while the next one is fused
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
-        judgement = Judgement()
+        judgement = judged()
         if lr is hr:
             halves = columns_apart if session.contract.denoiser.endswith(SPREAD) else even_and_odd
             frame.lrhs_luminance, frame.hrls_luminance = halves(averages.rgb)
         else:
             frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb
-            judgement = check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
         if frame.trust is not None and not judgement.independent:
             # The noise of one render can't be told from detail by that of the other one.
             again = partial(fuse, lr, hr, session, error=error, trust=False, clean_aovs=clean_aovs, half=half)
             return again(share=share, max_memory=max_memory, held=held, progress=progress)
         frame.warnings += judgement.warnings
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
+    frame.warnings += _lost(frame, pair)
+    frame.seconds = session.seconds - seconds
+    return frame
+
+
+def _lost(frame: FusedFrame, pair: FramePair) -> Iterator[Finding]:
+    """Yield what a fused frame lacks because its renders lack it, one sentence each."""
     for name in (ALBEDO, NORMAL):
         if (broken := frame.repaired.get(f"hrls.{name}", 0) / frame.rgb.size) > 0.5:
             lost = f"{broken:.0%} of the HRLS's {name} is NaN or infinite, so it tells little of the surfaces"
-            frame.warnings.append(Finding("broken_aov", f"{lost}; render it again"))
-    frame.seconds = session.seconds - seconds
+            yield Finding("broken_aov", f"{lost}; render it again")
     if frame.alpha is not None and not pair.lrhs_has_alpha:
-        frame.warnings.append(Finding("no_alpha", "the LRHS has no alpha, so the noisy alpha of the HRLS is kept"))
-    return frame
+        yield Finding("no_alpha", "the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
 
 
 def check_model(session: Session, scale: int, *, error: bool) -> None:

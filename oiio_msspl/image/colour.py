@@ -77,8 +77,11 @@ def luminance(rgb: Array) -> Array:
 
     The sum is written out, because a matrix product rounds differently for other layouts in memory.
     """
-    red, green, blue = (np.float32(weight) * rgb[..., i] for i, weight in enumerate(LUMINANCE_WEIGHTS))
-    return np.asarray(red + green + blue)
+    red, green, blue = map(np.float32, LUMINANCE_WEIGHTS)
+    total = np.asarray(red * rgb[..., 0])
+    total += green * rgb[..., 1]
+    total += blue * rgb[..., 2]
+    return total
 
 
 def srgb(linear: Array) -> Array:

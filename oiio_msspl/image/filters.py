@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.image.arrays import FLOAT_MAX, Array, Mask, planes_of
+from oiio_msspl.image.arrays import FLOAT_MAX, Array, Mask, all_finite, planes_of
 from oiio_msspl.image.parallel import for_row_blocks
 
 T = TypeVar("T", bound=np.generic)
@@ -33,7 +33,8 @@ def box_downsample(image: NDArray[Any], scale: int) -> Array:
         with np.errstate(over="ignore"):
             row_sums = reduce(np.add, (block[y::scale] for y in range(scale)))
             sums = reduce(np.add, (row_sums[:, x::scale] for x in range(scale)))
-        np.clip(sums, -FLOAT_MAX, FLOAT_MAX, out=sums)
+        if not all_finite(sums):
+            np.clip(sums, -FLOAT_MAX, FLOAT_MAX, out=sums)
         np.multiply(sums, np.float32(1 / scale**2), out=result[rows.start // scale : rows.stop // scale])
 
     for_row_blocks(work, len(image), image[:1].size, multiple=scale)

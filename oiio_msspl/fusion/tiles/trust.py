@@ -9,13 +9,13 @@ Denoising of Monte Carlo Rendered Images*). ``docs/design/trust.md`` has the ste
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import partial, reduce
 
 import numpy as np
 
 from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import blurred, box_downsample, halved, max_around, means_around, upsample_linear
-from oiio_msspl.image.parallel import two_at_a_time
+from oiio_msspl.image.parallel import in_parallel, two_at_a_time
 
 #: Reach of the windows in which energies are compared, in cells of each level; and how many levels there are: of cells
 #: of 1, 2 and 4 LRHS pixels. Large windows find faint detail, small ones find where it ends. They hold fewer pixels,
@@ -111,8 +111,9 @@ def trust_renders(
         energy = box_downsample(reduce(np.add, map(np.square, differences)), scale)
     relative = len(own) * np.square(_brightness(own.mean(axis=0)))
     energy, noise, common, change = (values / relative for values in (energy, noise, common, change))
-    points = _trust_in_points(energy, noise, common, change, darker, scale, reach)
-    trust = np.maximum(_trust_in_areas(energy, noise, common, change, darker, scale, reach), points)
+    evidence = energy, noise, common, change, darker, scale, reach
+    areas, points = in_parallel(partial(_trust_in_areas, *evidence), partial(_trust_in_points, *evidence))
+    trust = np.maximum(areas, points)
     # Points are whole LRHS pixels; between areas, trust is interpolated.
     weight = np.maximum(upsample_linear(trust, scale), points.repeat(scale, axis=0).repeat(scale, axis=1))
     for plane, pixels in zip(picture, render, strict=True):

@@ -136,6 +136,11 @@ def all_finite(values: Array) -> bool:
         return bool(np.isfinite(values.sum()))  # ten times as fast as a test of each
 
 
+def finite(values: Array) -> Array:
+    """Return values with 0 in place of NaN and infinities; the input itself if there are none."""
+    return values if all_finite(values) else np.where(np.isfinite(values), values, np.float32(0))
+
+
 def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bool_] | None]:
     """Replace NaN by 0, infinities by the largest half float and, unless ``signed``, negative values by 0.
 

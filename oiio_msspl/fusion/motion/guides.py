@@ -17,7 +17,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
-from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.arrays import Array, Mask, finite
 from oiio_msspl.image.filters import box_downsample, sum_3x3
 from oiio_msspl.image.parallel import in_parallel
 
@@ -116,7 +116,7 @@ def reduced(read: Callable[[Window], Array], window: Window, reduction: int) -> 
     """Read a window in strips of rows and average it down. NaN and infinities become 0."""
     strips = []
     for part in window.bands(ROWS * reduction):
-        strip = np.nan_to_num(read(part), nan=0.0, posinf=0.0, neginf=0.0)
+        strip = finite(read(part))
         strips.append(box_downsample(strip, reduction) if reduction > 1 else strip)
     return np.concatenate(strips)
 

@@ -149,11 +149,11 @@ class MotionSource:
             InputError: pixels can't be decoded.
         """
         lengths = (
-            np.sort(np.abs(vectors[..., "xy".index(axis)][known]))[-FEWEST:]
+            np.abs(vectors[..., "xy".index(axis)][known])
             for vectors, known in self._read_stored(hr).values()
             for axis in self.silent
         )
-        return any(len(longest) == FEWEST and not is_silent(longest[0]) for longest in lengths)
+        return any(len(way) >= FEWEST and not is_silent(np.partition(way, -FEWEST)[-FEWEST]) for way in lengths)
 
     def channels(self, hr: MappedRender) -> list[Channel]:
         """Return the channels of a frame with its motion vectors, two for each layer and the alpha if there is one."""

@@ -15,7 +15,7 @@ import numpy as np
 from oiio_msspl.aovs.features import NORMAL
 from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.exr.render import Window
-from oiio_msspl.image.arrays import Array, Mask, all_finite, planes_of
+from oiio_msspl.image.arrays import Array, Mask, finite, planes_of
 from oiio_msspl.image.filters import grown, means_around, sum_3x3
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices
@@ -115,12 +115,7 @@ def _means_at(image: Array, x: Array, y: Array) -> Array:
     steps = itertools.product((-1, 0, 1), repeat=2)
     around = np.stack([nearest_indices(x + column, y + row, image.shape[:2]) for row, column in steps])
     # An image may be stored in planes, and reshaping it would copy all of it.
-    return np.stack([_finite(plane.ravel().take(around)).mean(axis=0) for plane in planes_of(image)], axis=-1)
-
-
-def _finite(values: Array) -> Array:
-    """Return values with 0 in place of NaN and infinities."""
-    return values if all_finite(values) else np.where(np.isfinite(values), values, np.float32(0))
+    return np.stack([finite(plane.ravel().take(around)).mean(axis=0) for plane in planes_of(image)], axis=-1)
 
 
 def _differ(
@@ -149,7 +144,7 @@ def _differ(
         for name, planes in here.items():
             moved = np.stack([plane.ravel().take(nearest, mode="clip") for plane in others[name]])
             least = turn if name == NORMAL else DIFFERENCE
-            differs = _differing(_finite(planes[:, around]), _finite(moved), least, compared)
+            differs = _differing(finite(planes[:, around]), finite(moved), least, compared)
             if differs.any():
                 other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
         if other.any():

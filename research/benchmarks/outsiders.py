@@ -10,17 +10,15 @@ HRLS alone. With 1 spp there is one render, and both get it. OIDN runs as its do
 albedo and normal prefiltered. Seconds are those of the whole command. A shot in which the camera moves is scored by its
 flicker and its motion error, too: see `research.benchmarks.shots.measures`.
 
-OUT gets the renders, the results, ``table.csv``, and ``index.html`` with a page of pictures for each scene, in a folder
-``quick`` or ``full``. A run that was stopped continues. ``--oidn`` names a Python with another pyoidn, NumPy and
-OpenEXR; its rows join those of the first one.
+OUT gets the renders, the results, ``table.csv``, and a page of pictures for each scene, in a folder ``quick`` or
+``full``. A run that was stopped continues. ``--oidn`` names a Python with another pyoidn, NumPy and OpenEXR; its rows
+join those of the first one.
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
-import html
-import itertools
 import shutil
 import subprocess
 import sys
@@ -235,24 +233,9 @@ def _pixels(path: Path) -> Image:
 
 
 def write_pages(out: Path, rows: Sequence[results.Row]) -> None:
-    """Write a page of pictures for each scene, by ``msspl compare``, and ``index.html`` with the table."""
-    titles = (*KEYS, *SCORES)
-    lines = [[f"<th>{name.replace('_', ' ')}</th>" for name in titles]]
-    for (scene, kind, spp), group in itertools.groupby(rows, lambda row: tuple(row[key] for key in KEYS[:3])):
-        page = f"{scene}/{kind}/{spp}spp.html"
+    """Write a page of pictures for each scene, filter and number of samples, by ``msspl compare``."""
+    for scene, kind, spp in dict.fromkeys(tuple(row[key] for key in KEYS[:3]) for row in rows):
         _compare(out / scene / kind, int(spp), ".0001" if scene == SHOT else "")
-        for row in group:
-            link = f'<a href="{page}">{scene}</a>'
-            lines.append([f"<td>{link}</td>", *(f"<td>{html.escape(_cell(row, name))}</td>" for name in titles[1:])])
-    style = "body{font:15px sans-serif;margin:2em}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #ccc}"
-    table = "".join(f"<tr>{''.join(line)}</tr>\n" for line in lines)
-    (out / "index.html").write_text(
-        f"<!doctype html><meta charset=utf-8><title>Pairs and OIDN</title><style>{style}</style>\n"
-        "<h1>Pairs and OIDN</h1><p>spp: samples per pixel in all. PSNR is in dB, and better if higher. All others are "
-        "better if lower; motion error is in pixels. A scene's name leads to its pictures.</p>\n"
-        f"<table>\n{table}</table>\n",
-        encoding="utf-8",
-    )
 
 
 def _cell(row: results.Row, name: str) -> str:
@@ -298,7 +281,6 @@ def main() -> None:
     rows.sort(key=lambda row: (order[row["scene"], row["filter"]], row["spp"]))
     write_pages(out, rows)
     print(results.markdown((*KEYS, *SCORES), [[_cell(row, name) for name in (*KEYS, *SCORES)] for row in rows]))
-    print(out / "index.html")
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def test_another_oidn_has_rows_of_its_own_and_one_render_is_fused_alone(tmp_path
     ]
 
 
-def test_the_page_has_a_row_for_each_measurement_and_links_to_the_pictures(tmp_path, monkeypatch):
+def test_each_scene_has_one_page_of_pictures(tmp_path, monkeypatch):
     compared = []
     monkeypatch.setattr(outsiders, "_run", lambda command: compared.append(command) or "")
     rows = [
@@ -95,12 +95,9 @@ def test_the_page_has_a_row_for_each_measurement_and_links_to_the_pictures(tmp_p
         write_exr(folder / f"best/out{frame}.exr", np.zeros((4, 4, 3)), RGB)
         write_exr(folder / f"full{frame}.exr", np.zeros((4, 4, 3)), RGB)
     outsiders.write_pages(tmp_path, rows)
-    page = (tmp_path / "index.html").read_text()
-    assert page.count("<tr>") == 1 + len(rows) and page.count("30.13") == len(rows) and "OIDN &lt;3&gt;" in page
     assert [command[-1] for command in compared] == [
         str(tmp_path / name) for name in ("room/box/1spp.html", "room/box/2spp.html", "shot/box/2spp.html")
     ]
-    assert all(f'href="{name}"' in page for name in ("room/box/1spp.html", "shot/box/2spp.html"))
 
 
 def test_files_that_exist_are_not_rendered_again(tmp_path):

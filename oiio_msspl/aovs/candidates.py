@@ -15,7 +15,7 @@ from typing import Any
 
 from oiio_msspl.aovs.features import NORMAL, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
-from oiio_msspl.aovs.mapping import split_exr
+from oiio_msspl.aovs.mapping import SAMPLES, split_exr
 from oiio_msspl.aovs.renderers import (
     best_spelled,
     candidates_of,
@@ -37,14 +37,22 @@ class LayerFinder:
     """Finder of candidates' layers in one view and view layer of a file."""
 
     def __init__(
-        self, file: ExrFile, layers: list[Layer], renderer: dict[str, Any], view: str, view_layer: str
+        self,
+        file: ExrFile,
+        layers: list[Layer],
+        renderer: dict[str, Any],
+        view: str,
+        view_layer: str,
+        spp: float | None = None,
     ) -> None:
-        self._file, self._renderer = file, renderer
+        self._file, self._renderer, self._spp = file, renderer, spp
         self._layers = [layer for layer in layers if layer.view in (view, "")]
         self._view, self._view_layer = view, view_layer
 
     def formula(self, feature: str, candidate: Any, problems: list[str]) -> FeatureFormula | None:
         """Return the formula that a candidate describes; None if a layer is missing or has the wrong channels.
+
+        The variance of samples is none either, unless their number is known.
 
         Args:
             candidate: checked by :func:`oiio_msspl.aovs.mapping.check_mapping`.
@@ -66,7 +74,13 @@ class LayerFinder:
         is_exr = feature == NORMAL and bool(split_exr(str(entry.get("layer", "")))[0])
         encoding, note = entry.get("encoding", "auto" if is_exr else "signed"), entry.get("note", "")
         text = _text([name for _, name in found], factor is not None)
-        return FeatureFormula(tuple(groups), factor, encoding, text, note)
+        samples = self._spp if entry.get("of") == SAMPLES else 1.0
+        if samples is None:
+            problems.append(f"{feature}: {text} is that of samples, and no header tells the spp; give --hr-spp")
+            return None
+        if samples != 1:
+            text += f" / {samples:g} spp"
+        return FeatureFormula(tuple(groups), factor, samples, encoding, text, note)
 
     def _group(
         self, feature: str, alias: str | list[str], problems: list[str]

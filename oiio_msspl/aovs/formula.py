@@ -21,11 +21,13 @@ Take = Callable[[Sequence[Channel]], Array]
 
 @dataclass(frozen=True)
 class FeatureFormula:
-    """How one feature is computed: ``(sum of terms) * factor``, then a conversion to the feature's unit."""
+    """How one feature is computed: ``(sum of terms) * factor / samples``, then a conversion to the feature's unit."""
 
     terms: tuple[tuple[Channel, ...], ...]
     """Groups of channels, three each, or one each for a variance in luminance."""
     factor: tuple[Channel, ...] | None = None
+    samples: float = 1.0
+    """spp, if a layer holds the variance of single samples."""
     encoding: str = "signed"
     """Of a normal: ``signed`` or ``unsigned`` (n * 0.5 + 0.5)."""
     text: str = ""
@@ -48,6 +50,8 @@ class FeatureFormula:
         value = reduce(np.add, map(take, self.terms))
         if self.factor is not None:
             value = value * take(self.factor)
+        if self.samples != 1:
+            value = value / np.float32(self.samples)
         if self.encoding != "unsigned":
             return value
         normal = value * 2 - 1

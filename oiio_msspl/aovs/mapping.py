@@ -21,7 +21,9 @@ NORMAL_ENCODINGS = ("signed", "unsigned", "auto")
 #: Keys that say which layers a candidate reads, and whether their value is a list of names. A candidate has one.
 _FORMS = {"layer": False, "sum": True, "channels": True}
 #: Further keys of a candidate.
-_EXTRAS = {"times", "encoding", "note"}
+_EXTRAS = {"times", "encoding", "note", "of"}
+#: What a variance may be of, if it is not that of the pixel's mean.
+SAMPLES = "samples"
 
 
 def read_map_file(path: str | Path) -> dict[str, Any]:
@@ -140,6 +142,8 @@ def _problem_of_feature(feature: str, candidate: dict[str, Any]) -> str | None:
         return "variances don't add up layer by layer; give one layer"
     if form == "channels" and count not in ((1, 3) if feature == VARIANCE else (3,)):
         return f"has {count} channels, not 3"
+    if "of" in candidate and (feature != VARIANCE or candidate["of"] != SAMPLES):
+        return f"of {candidate['of']!r}: only a variance may be of {SAMPLES!r}"
     if "encoding" in candidate and (feature != NORMAL or encoding not in NORMAL_ENCODINGS):
         return f"encoding {encoding!r}: only a normal has an encoding, one of {', '.join(NORMAL_ENCODINGS)}"
     return None

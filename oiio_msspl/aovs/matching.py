@@ -75,7 +75,8 @@ def map_render(
     assert rgb is not None
     notes: list[str] = []
     formulas = {RGB: FeatureFormula((rgb,), text=beauty.layer.name or " ".join(c.name for c in rgb))}
-    finder = LayerFinder(file, layers, renderer, beauty.view, beauty.view_layer)
+    spp = spp if spp is not None else samples_per_pixel(renderer, file, beauty.view_layer)
+    finder = LayerFinder(file, layers, renderer, beauty.view, beauty.view_layer, spp)
     for feature in features:
         problems: list[str] = []
         if feature not in mapping:
@@ -100,7 +101,7 @@ def map_render(
         other_views=[label for label in labels if label != beauty.label],
         features=formulas,
         alpha=alpha,
-        spp=spp if spp is not None else samples_per_pixel(renderer, file, beauty.view_layer),
+        spp=spp,
         data_window=file.parts[formulas[RGB].terms[0][0].part].data_window,
         additive_sets=find_additive_sets(renderer, layers, beauty, sums, file),
         motion=find_motion_layers(renderer, layers, beauty, [c for f in formulas.values() for c in f.channels]),

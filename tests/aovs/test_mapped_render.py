@@ -5,6 +5,7 @@ import pytest
 
 from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.model.encoding import luminance_variance
@@ -26,6 +27,21 @@ def test_a_luminance_variance_is_taken_as_it_is(tmp_path):
     render = mapped(tmp_path, layer("", 1) | {"variance.Y": plane(0.25)})
     assert render.read(render.data_window)["variance"].shape == (H, W, 1)
     assert render.read(render.data_window)["variance"][0, 0, 0] == 0.25
+
+
+def test_the_variance_of_samples_is_divided_by_their_number(tmp_path):
+    """pbrt writes it, and the samples per pixel into the header; the user's number comes first."""
+    channels = layer("", 1) | {f"Variance.{c}": plane(0.5) for c in "RGB"} | layer("Ns", 0)
+    known = mapped(tmp_path, channels, attributes={"samplesPerPixel": 16})
+    assert (known.renderer, sources(known)["variance"]) == ("pbrt-v4", "Variance / 16 spp")
+    np.testing.assert_allclose(known.read(known.data_window)["variance"], 0.5 / 16, rtol=1e-3)
+    by_user = map_render(known.file, spp=8)
+    np.testing.assert_allclose(by_user.load().layers["variance"], 0.5 / 8, rtol=1e-3)
+    unknown = mapped(tmp_path, channels, stem="unknown")
+    assert "variance" not in unknown.features
+    assert "variance: Variance is that of samples, and no header tells the spp; give --hr-spp" in unknown.notes
+    with pytest.raises(InputError, match="give --hr-spp"):
+        map_render(unknown.file, {"variance": {"layer": "Variance", "of": "samples"}})
 
 
 @needs_shared("exr")

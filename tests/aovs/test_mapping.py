@@ -15,6 +15,8 @@ from oiio_msspl.errors import InputError
         ('albedo = ["a", "b"]', "is neither a layer's name nor a table"),
         ('albedo = { channels = ["a.R", "a.G"] }', "has 2 channels, not 3"),
         ('albedo = { channels = "R" }', "channels must be a list of names"),
+        ('variance = { layer = "v", of = "pixels" }', "of 'pixels': only a variance may be of 'samples'"),
+        ('albedo = { layer = "a", of = "samples" }', "of 'samples': only a variance"),
         ('normal = { layer = "n", encoding = "foo" }', "encoding 'foo': only a normal has an encoding, one of signed"),
         ('albedo = { lay = "a" }', "has lay; give one of layer, sum"),
         ('rgb = { sum = ["a", "b"] }', "must be a single layer"),

@@ -82,6 +82,8 @@ def expected(feature, source, layers, render):
     result = sum(values[name] for name in entry.get("sum", [entry.get("layer") or "R"]))
     if feature == NORMAL:
         return result * 2 - 1 if render.get("normals") == "unsigned" else result
+    if entry.get("of") == "samples":
+        return result / render["spp"]
     return result * values[entry["times"]] if "times" in entry else result
 
 

@@ -160,7 +160,7 @@ class Session:
         start = time.perf_counter()
         pixels = lrhs[RGB].shape[0] * lrhs[RGB].shape[1]
         if pixels > self._largest:
-            self.release_memory()  # memory of smaller pictures would be held beside that of this one
+            self.release_memory(to_system=False)  # memory of smaller pictures would be held beside that of this one
             self._largest = pixels
         wanted = ["fused", *(["log_error"] if error else []), *aovs]
         try:
@@ -196,12 +196,15 @@ class Session:
                 feed[key] = np.full(size, default_value(name, exposure), np.float32)
         return feed
 
-    def release_memory(self) -> None:
-        """Give the memory of intermediate results on the CPU back to the system. The next run allocates it again."""
+    def release_memory(self, *, to_system: bool = True) -> None:
+        """Give the memory of intermediate results on the CPU back, to the system or to other arrays of this process.
+
+        The next run allocates it again.
+        """
         self._largest = 0
         if self.provider != CPU:
             return
         low = -(-SMALLEST // self.contract.alignment) * self.contract.alignment
         # The other features get their defaults.
         lrhs, hrls = ({RGB: np.zeros((n, n, 3), np.float32)} for n in (low, low * self.contract.scale))
-        release_memory(self._session, self._feed(lrhs, hrls, 1.0, {}))
+        release_memory(self._session, self._feed(lrhs, hrls, 1.0, {}), to_system=to_system)

@@ -73,7 +73,7 @@ def fuse_alone(
             del task  # or its memory would be held while the next one is fused
         if frame.trust is not None and trust is not None:
             frame.trust += alone * (trust - frame.trust)
-    session.release_memory()
+    session.release_memory(to_system=False)
     frame.seconds += session.seconds - seconds
 
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -77,7 +78,7 @@ class ShotRun:
         self._wanted = {files.number: files for files in wanted}
         self._timeline = plan.timeline(wanted)
         self._frames: dict[Key, ShotFrame] = {}
-        self._last_read: dict[str | None, ShotFrame] = {}
+        self._last_read = WeakValueDictionary[str | None, ShotFrame]()
         self._motion = {view: ShotMotion(own.motion) for view, own in plan.views.items() if own.motion is not None}
 
     @property
@@ -101,7 +102,7 @@ class ShotRun:
                 frame.renders.prepare()
                 if before is not None and frame.number == before.number + 1:
                     self._motion[view].between(before.for_motion, frame.for_motion)
-        self._last_read = in_memory
+        self._last_read = WeakValueDictionary(in_memory)  # which keeps no pixels
         return frames
 
     def take(self, views: Sequence[ShotFrame]) -> Iterator[ShotFrame]:

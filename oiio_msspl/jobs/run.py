@@ -94,8 +94,8 @@ class ShotRun:
     def read(self, files: FrameFiles) -> list[ShotFrame]:
         """Read a frame, and what its average needs. While one is fused, another thread can read the next one."""
         frames = read_frame(files, self.settings, self.plan, only_frame=self._only_frame)
-        averaged = [frame for frame in frames if frame.was_read and frame.plan.reach.renders]
-        in_memory = {frame.view: frame for frame in averaged if frame.memory is not None and frame.memory.fits}
+        averaged = (frame for frame in frames if frame.was_read and frame.plan.reach.renders)
+        in_memory = {frame.view: frame for frame in averaged if frame.memory and frame.memory.fits}
         for view, frame in in_memory.items():
             before = self._last_read.get(view)
             with contextlib.suppress(Exception):  # the average will meet it again, and say it

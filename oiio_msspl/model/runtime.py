@@ -5,17 +5,16 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import ctypes
 import functools
 import io
 import logging
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from oiio_msspl.errors import InputError
+from oiio_msspl.image.allocator import give_back_memory
 from oiio_msspl.image.arrays import Array
 
 log = logging.getLogger(__name__)
@@ -95,9 +94,8 @@ def release_memory(network: Network, feed: Mapping[str, Array], *, to_system: bo
     options = onnxruntime.RunOptions()
     options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
     network.run(None, dict(feed), options)
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if to_system and sys.platform == "linux" else None
-    if trim is not None:  # glibc may keep what is freed
-        trim(0)
+    if to_system:
+        give_back_memory()
 
 
 def _load_cuda() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.image.allocator import keep_memory
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
@@ -182,6 +183,7 @@ def test_memory_is_given_back():
     def resident():
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
+    keep_memory()  # as programs do
     session = Session(find_model(2, "joint"))
     session.run(*pair(session, 384, 384), 1.0, {"rgb": 0.5})
     held = resident()

@@ -307,13 +307,14 @@ class ShotRun:
         """Forget what no frame needs any more."""
         renders, pictures = self._timeline.needs_renders(), self._timeline.needs_pictures()
         for key, frame in list(self._frames.items()):
+            if key not in renders and frame.was_read:
+                frame.renders = RenderPair(*frame.stored)  # the files can still be read, also while it is written
             if key not in renders | pictures:
+                frame.vectors = {}
                 del self._frames[key]
                 if frame.view in self._motion:
                     self._motion[frame.view].forget(frame.number)
                 continue
-            if key not in renders and frame.was_read:
-                frame.renders = RenderPair(*frame.stored)  # the files can still be read
             if key not in pictures:
                 frame.fused = None
             if not self._timeline.waits(frame.number):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 # Nuke runs this file after init.py when it starts with a user interface.
-import msspl_nuke
+import nuke
 
-msspl_nuke.add_menu()
+nuke.menu("Nodes").addMenu("MSSPL").addCommand("MSSPLFuse", lambda: nuke.createNode("MSSPLFuse"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the gizmo's buttons and the menu. Only this module and init.py import nuke.
+"""Runs the gizmo's buttons. Only this module, init.py and menu.py import nuke.
 
 A button runs in Nuke's main thread and starts a thread that watches msspl-fuse. Nodes may be touched in the main thread
 only, so the watching thread calls ``nuke.executeInMainThread``.
@@ -32,13 +32,6 @@ _MADE_BY = "msspl_made_by"
 _running: set[str] = set()
 
 
-def add_menu() -> None:
-    """Add the gizmo and "Copy to group" to Nuke's toolbar."""
-    menu = nuke.menu("Nodes").addMenu("MSSPL")
-    menu.addCommand("MSSPLFuse", lambda: nuke.createNode("MSSPLFuse"))
-    menu.addCommand("Copy to group", copy_to_group)
-
-
 def fuse_frame(node: nuke.Node) -> None:
     """Fuse the current frame in the background."""
     _start(node, int(nuke.frame()))
@@ -67,27 +60,6 @@ def rebuild(node: nuke.Node) -> None:
                 group.setXYpos(read.xpos() + 120 * column, read.ypos() + 100)
     except FuseError as error:
         nuke.message(f"{node.name()}: {error}")
-
-
-def copy_to_group() -> None:
-    """Replace the selected gizmos by groups. A script with groups loads where the gizmo is not installed."""
-    gizmos = [n for n in nuke.selectedNodes() if isinstance(n, nuke.Gizmo) and n.knob("fuse_frame")]
-    if not gizmos:
-        nuke.message("Select an MSSPLFuse gizmo first. A group needs no copy.")
-    with nuke.Undo("Copy to group"):
-        for gizmo in gizmos:
-            name = gizmo.name()
-            with gizmo.parent():
-                group = gizmo.makeGroup()
-            for i in range(gizmo.inputs()):
-                group.setInput(i, gizmo.input(i))
-            for user in gizmo.dependent(nuke.INPUTS | nuke.HIDDEN_INPUTS):
-                for i in range(user.inputs()):
-                    if user.input(i) == gizmo:
-                        user.setInput(i, group)
-            group.setXYpos(gizmo.xpos(), gizmo.ypos())
-            nuke.delete(gizmo)
-            group.setName(name)
 
 
 # ---------------------------------------------------------------------------------- start a job, in the main thread

@@ -165,9 +165,6 @@ class Node:
         self._inputs[i] = node
         return True
 
-    def dependent(self, mask):
-        return [n for n in self.nuke.everything if self in n._inputs]
-
     def channels(self):
         """Of the EXR that a Read reads at the current frame: Nuke knows no dots and spaces in the names of layers."""
         file = open_exr(Path(self.metadata("input/filename", self.nuke.frame_number)))
@@ -296,15 +293,15 @@ _PLAIN_NODES = {
 class FakeNuke(types.ModuleType):
     """The module ``nuke`` of one session, and what a test needs to drive it."""
 
-    INPUTS, HIDDEN_INPUTS, INVISIBLE = 1, 2, 1024
+    INVISIBLE = 1024
     EXE_PATH = "/opt/Nuke15.1v1/Nuke15.1"
-    Gizmo, Node, File_Knob, Script_Knob, String_Knob = Gizmo, Node, File_Knob, Script_Knob, String_Knob
+    Node, File_Knob, Script_Knob, String_Knob = Node, File_Knob, Script_Knob, String_Knob
     Double_Knob, Enumeration_Knob, Group = Double_Knob, Enumeration_Knob, Group
 
     def __init__(self, gizmo: dict[int, ScriptNode]):
         super().__init__("nuke")
         self._gizmo, self._calls, self._menus = gizmo, queue.Queue(), {}
-        self.everything, self.selected, self.messages, self.warnings = [], [], [], []
+        self.everything, self.messages = [], []
         Node.nuke = self
         self.Undo = type("Undo", (Undo,), {"nuke": self})
         self.undo_group, self.undo_steps, self.view_names = None, [], ["main"]
@@ -334,10 +331,6 @@ class FakeNuke(types.ModuleType):
         _require_main_thread()
         self.messages.append(prompt)
 
-    def warning(self, message):
-        _require_main_thread()
-        self.warnings.append(message)
-
     def tprint(self, *args):
         self.messages.append(" ".join(args))
 
@@ -350,9 +343,6 @@ class FakeNuke(types.ModuleType):
 
     def allNodes(self, filter):
         return [n for n in self.nodes_of(self.contexts[-1]) if n.Class() == filter]
-
-    def selectedNodes(self):
-        return list(self.selected)
 
     def menu(self, name):
         return self._menus.setdefault(name, Menu())

@@ -204,27 +204,18 @@ def test_a_node_runs_one_job_at_a_time_and_may_be_deleted_meanwhile(host, tmp_pa
     assert host.messages[1:] == [f"MSSPLFuse1 was deleted; its result is {tmp_path}/hr_fused.%04d.exr"]
 
 
-def test_the_menu_makes_a_node_and_copies_it_to_a_group(host):
+def test_the_menu_makes_a_node(host):
     exec((FOLDER / "menu.py").read_text(encoding="utf-8"), {})
     entries = host.menu("Nodes").entries["MSSPL"].entries
-    assert list(entries) == ["MSSPLFuse", "Copy to group"]
+    assert list(entries) == ["MSSPLFuse"]
     entries["MSSPLFuse"]()
     assert host.everything[-1].name() == "MSSPLFuse2"
-    entries["Copy to group"]()
-    assert host.messages == ["Select an MSSPLFuse gizmo first. A group needs no copy."]
 
 
-def test_copy_to_group_keeps_name_knobs_and_connections_and_its_buttons_work(host, tmp_path):
-    viewer = host.add(Node("Viewer", "Viewer1", inputs=1))
-    viewer.setInput(0, host.gizmo)
-    host.gizmo["layers"].setValue("none")
-    host.selected = [host.gizmo]
-    importlib.import_module("msspl_nuke").copy_to_group()
-    group = viewer.input(0)
-    assert (group.Class(), group.name(), group["layers"].value()) == ("Group", "MSSPLFuse1", "none")
-    assert [group.input(i) for i in range(2)] == host.reads[::-1]
-    assert (group.xpos(), group.ypos()) == (40, 200)
-    assert host.gizmo not in host.everything
+def test_the_buttons_of_a_group_that_nuke_makes_of_the_gizmo_work(host):
+    group = host.gizmo.makeGroup()
+    for index, read in enumerate(reversed(host.reads)):
+        group.setInput(index, read)
     host.press(group, "fuse_frame")
     host.wait()
     assert (host.messages, len(results(host))) == ([], 1)

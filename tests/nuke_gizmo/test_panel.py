@@ -75,11 +75,6 @@ def test_undo_takes_back_all_that_a_button_did(host):
     assert host.undo_steps == ["MSSPLFuse1"]
     fuse(host, "rebuild")
     assert host.undo_steps[1:] == ["Rebuild from passes"]
-    host.selected = [host.gizmo]
-    import msspl_nuke
-
-    msspl_nuke.copy_to_group()
-    assert host.undo_steps[2:] == ["Copy to group"]
 
 
 @pytest.fixture

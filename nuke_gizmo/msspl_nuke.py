@@ -272,13 +272,7 @@ def _rebuild_group(read: nuke.Node, name: str, terms: list[list[str]]) -> nuke.G
     group.setInput(0, read)
     show = nuke.Enumeration_Knob("show", "show", ["rebuild", "difference"])
     show.setTooltip("rebuild: the sum of the layers. difference: how far it is from the fused beauty.")
-    exposure = nuke.Double_Knob("exposure", "difference exposure")
-    exposure.setTooltip(
-        "In stops. The difference of a file with half floats is their rounding: it appears at about 10."
-    )
-    exposure.setRange(0, 20)
-    for knob in (show, exposure):
-        group.addKnob(knob)
+    group.addKnob(show)
     with group:
         source = nuke.nodes.Input()
         total: nuke.Node | None = None
@@ -293,9 +287,7 @@ def _rebuild_group(read: nuke.Node, name: str, terms: list[list[str]]) -> nuke.G
         assert total is not None
         alpha = _node("Copy", [total, source], 0, 400, from0="rgba.alpha", to0="rgba.alpha")
         difference = _merge("difference", source, total, 120, 400)
-        gain = _node("Multiply", [difference], 120, 450, channels="rgb")
-        gain["value"].setExpression("pow(2, parent.exposure)")
-        switch = _node("Switch", [alpha, gain], 0, 500)
+        switch = _node("Switch", [alpha, difference], 0, 500)
         switch["which"].setExpression("parent.show")  # the index of its value
         _node("Output", [switch], 0, 550)
     return group

@@ -61,14 +61,6 @@ class String_Knob(Knob):
     pass
 
 
-class Double_Knob(Knob):
-    def __init__(self, name, label="", value=0.0):
-        super().__init__(name, label, value)
-
-    def setRange(self, low, high):
-        assert low < high
-
-
 class Enumeration_Knob(Knob):
     def __init__(self, name, label, items):
         super().__init__(name, label, items[0])
@@ -285,7 +277,6 @@ _PLAIN_NODES = {
     "Shuffle": {"in": "rgba", "label": ""},
     "Merge2": {"operation": "over", "output": "rgba"},
     "Copy": {"from0": "", "to0": ""},
-    "Multiply": {"channels": "all", "value": 1.0},
     "Switch": {"which": 0},
 }
 
@@ -296,7 +287,7 @@ class FakeNuke(types.ModuleType):
     INVISIBLE = 1024
     EXE_PATH = "/opt/Nuke15.1v1/Nuke15.1"
     Node, File_Knob, Script_Knob, String_Knob = Node, File_Knob, Script_Knob, String_Knob
-    Double_Knob, Enumeration_Knob, Group = Double_Knob, Enumeration_Knob, Group
+    Enumeration_Knob, Group = Enumeration_Knob, Group
 
     def __init__(self, gizmo: dict[int, ScriptNode]):
         super().__init__("nuke")

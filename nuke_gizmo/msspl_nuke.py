@@ -227,7 +227,13 @@ def _load(job: _Job, node_name: str, written: list[int]) -> None:
     """Load frames into the Read that an earlier job made for this node, or into a new one below the node."""
     with job.node.parent():
         made = _made_read(node_name)
-        read = made or _new_read(job.node, node_name)
+        read = made or nuke.nodes.Read()
+    if not made:
+        link = nuke.String_Knob(_MADE_BY)
+        link.setFlag(nuke.INVISIBLE)
+        read.addKnob(link)
+        link.setValue(node_name)
+        read.setXYpos(job.node.xpos(), job.node.ypos() + 100)
     numbers = written or [1 if job.out.number is None else job.out.number]
     first, last = min(numbers), max(numbers)
     if read["file"].value() == job.out.pattern:  # Frames that were fused one by one extend the Read's range.
@@ -247,16 +253,6 @@ def _made_read(node_name: str) -> nuke.Node | None:
     """Return the Read that an earlier job made for a node of the current group."""
     reads = nuke.allNodes("Read")
     return next((n for n in reads if n.knob(_MADE_BY) and n[_MADE_BY].value() == node_name), None)
-
-
-def _new_read(node: nuke.Node, node_name: str) -> nuke.Node:
-    read = nuke.nodes.Read()
-    link = nuke.String_Knob(_MADE_BY)
-    link.setFlag(nuke.INVISIBLE)
-    read.addKnob(link)
-    link.setValue(node_name)
-    read.setXYpos(node.xpos(), node.ypos() + 100)
-    return read
 
 
 # ------------------------------------------------------------------------------- rebuild the beauty, in the main thread

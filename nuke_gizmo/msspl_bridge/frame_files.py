@@ -27,10 +27,9 @@ class FrameFile:
 
     @property
     def path(self) -> str:
-        return self.pattern if self.number is None else _NUMBER.sub(self._digits, self.pattern)
-
-    def _digits(self, token: re.Match[str]) -> str:
-        return f"{self.number:0{int(token[1])}d}"
+        if self.number is None:
+            return self.pattern
+        return _NUMBER.sub(lambda token: f"{self.number:0{int(token[1])}d}", self.pattern)
 
     def in_view(self, view: str) -> FrameFile:
         """Return the file of a view: ``%V`` is its name, ``%v`` its first letter."""
@@ -61,7 +60,8 @@ def find_number(pattern: str, path: str) -> FrameFile:
     token = _NUMBER.search(name)
     if token is None:
         return FrameFile(pattern if stereo else path)
-    before, after = (_match_any_view(part) for part in (name[: token.start()], name[token.end() :]))
+    around = name[: token.start()], name[token.end() :]
+    before, after = (".+?".join(map(re.escape, _VIEW.split(part))) for part in around)  # of any view
     match = re.fullmatch(f"{before}(-?[0-9]+){after}", posixpath.basename(path))
     if not match:
         raise FuseError(f"{path}: does not match the pattern {pattern}; rename the file, or correct the Read's file")
@@ -92,9 +92,8 @@ def name_output(text: str, hrls: FrameFile, frame: int) -> FrameFile:
     if not os.path.isabs(text):
         raise FuseError(f"output {text}: is a relative path; give the full path, folder included")
     pattern = _with_width(with_slashes(text))
-    if not _NUMBER.search(pattern):
-        return FrameFile(pattern)
-    return FrameFile(pattern, frame if hrls.number is None else hrls.number)
+    number = frame if hrls.number is None else hrls.number
+    return FrameFile(pattern, number if _NUMBER.search(pattern) else None)
 
 
 def file_numbers(inputs: Sequence[ReadRange], out: FrameFile, first: int, last: int) -> tuple[int, int]:
@@ -123,10 +122,6 @@ def file_numbers(inputs: Sequence[ReadRange], out: FrameFile, first: int, last: 
 def with_slashes(path: str) -> str:
     """Replace the separators of Windows, because a backslash is an escape character in Tcl and in a shell."""
     return path.replace(os.sep, "/")
-
-
-def _match_any_view(text: str) -> str:
-    return ".+?".join(re.escape(part) for part in _VIEW.split(text))
 
 
 def _with_width(pattern: str) -> str:

@@ -1,25 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Renders and fuses a list of frames without a window, as :mod:`.headless` gets them from msspl-render."""
 
-import os
-import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import bpy
 from bpy.types import Scene
 
 from . import render_settings
-from .checks import check_animation, check_scene
+from .checks import check_scene
 from .errors import Failure
 from .frame import Progress, loaded_once, render_and_fuse, run_to_end
 from .options import Options, find_view_layer, hrls_size
 from .overrides import override
-from .render import escape_path, render
 
 #: Prints a message for msspl-render, given as keyword arguments.
 Send = Callable[..., None]
@@ -48,7 +44,6 @@ def run_job(job: dict[str, Any], send: Send, receive: Callable[[], None]) -> Non
     if options.vectors and scene.render.use_motion_blur:
         send(no_vectors="motion blur is on, and Cycles then writes no motion vectors; turn it off")
         options = replace(options, vectors=False)
-    reports = []
     with loaded_once(scene):
         for index, (number, output) in enumerate(job["frames"]):
             if number is not None:
@@ -57,11 +52,9 @@ def run_job(job: dict[str, Any], send: Send, receive: Callable[[], None]) -> Non
                 check_scene(scene, options)
                 send(size=hrls_size(scene), **_passes(scene, options))
             if output is not None or options.vectors:
-                reports.append(_run_frame(scene, options, job, output, send, receive))
+                report = _run_frame(scene, options, job, output, send, receive)
                 if output is not None:
-                    send(report=reports[-1])
-        if job["compare"]:
-            _compare(scene, options, job, reports, send)
+                    send(report=report)
 
 
 def _open_scene(file: str, name: str) -> None:
@@ -115,52 +108,3 @@ def _run_frame(
     )
     report = run_to_end(steps, on_step)
     return {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
-
-
-def _compare(
-    scene: Scene, options: Options, job: dict[str, Any], reports: Sequence[dict[str, Any]], send: Send
-) -> None:
-    """Render the frames that are written in the ordinary way with OIDN, with as many samples as the mean frame allows.
-
-    The time of a single frame does not tell, because it may be fused together with frames that waited for it. The first
-    frame tells the samples, and all frames get as many.
-    """
-    seconds, samples = (fmean(report[key] for report in reports) for key in ("seconds", "plain_spp"))
-    most = 3
-    for number, output in job["frames"]:
-        if output is None:
-            continue
-        if number is not None:
-            scene.frame_set(number)
-        oidn = _render_plain(scene, options, job, seconds, samples, most, send)
-        samples, most = oidn["spp"], 1
-        beside = Path(output).with_name(f"{Path(output).stem}_oidn.exr")
-        os.replace(oidn["file"], beside)
-        send(frame=scene.frame_current, oidn=oidn | {"file": str(beside)})
-
-
-def _render_plain(
-    scene: Scene, options: Options, job: dict[str, Any], seconds: float, samples: float, most: int, send: Send
-) -> dict[str, Any]:
-    """Render the frame the ordinary way with OIDN, in a given time, with about so many samples per pixel.
-
-    Render times cannot be predicted well. So each of at most ``most`` attempts sets the spp of the next one from its
-    own time, and the closest attempt is kept.
-    """
-    attempts: dict[int, dict[str, Any]] = {}
-    # The time of a single frame includes loading the scene. In a shot, all frames share the scene that is loaded.
-    loading = {"render.use_persistent_data": len(job["frames"]) > 1}
-    while len(attempts) < most and (spp := max(1, round(samples))) not in attempts:
-        send(frame=scene.frame_current, step=f"ordinary render with OIDN, {spp} spp", fraction=1.0)
-        start = time.perf_counter()
-        file = Path(job["work"], f"oidn{spp}.exr")
-        values = render_settings.plain(scene, options, spp) | loading
-        with override(scene, values | {"render.filepath": escape_path(str(file))}):
-            check_animation(scene, values)
-            list(render(scene, str(file)))
-        attempts[spp] = {"spp": spp, "seconds": time.perf_counter() - start, "file": str(file)}
-        ratio = seconds / attempts[spp]["seconds"]
-        if 0.9 < ratio < 1.1:
-            break
-        samples = spp * ratio
-    return min(attempts.values(), key=lambda attempt: abs(attempt["seconds"] - seconds))

@@ -13,8 +13,6 @@ The job is a JSON object:
     work       folder for temporary files, on the same file system as the results
     options    fields of :class:`.options.Options`
     overwrite  replace results that exist
-    compare    after the last frame, also write an ordinary render of each, denoised with OIDN, that takes as long as
-               the frames do in the mean
 
 Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON object. After the line
 ``MSSPL {"fuse": [file]}``, or two files, msspl-render fuses these renders, and deletes them when no frame needs them

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The scene settings of the renders to fuse and of an ordinary render, as ``{data path: value}``.
+"""The scene settings of the renders to fuse, as ``{data path: value}``.
 
 Dictionaries of data paths can be merged, read back and restored by code that knows none of the settings.
 """
@@ -55,19 +55,6 @@ def hrls(scene: Scene, options: Options) -> dict[str, Any]:
         "render.resolution_x": width,
         "render.resolution_y": height,
         "cycles.samples": options.hrls_spp,
-    }
-
-
-def plain(scene: Scene, options: Options, spp: int) -> dict[str, Any]:
-    """Return the settings of an ordinary render that Cycles denoises with OIDN at its highest quality."""
-    return hrls(scene, options) | {
-        "cycles.samples": spp,
-        "cycles.use_denoising": True,
-        f"{view_layer_path(find_view_layer(scene, options))}.cycles.use_denoising": True,
-        "cycles.denoiser": "OPENIMAGEDENOISE",
-        "cycles.denoising_input_passes": "RGB_ALBEDO_NORMAL",
-        "cycles.denoising_prefilter": "ACCURATE",
-        "cycles.denoising_quality": "HIGH",
     }
 
 

@@ -57,8 +57,8 @@ def render_frames(
     Args:
         job: the frames and the settings that headless.py reads.
         folder: the folder of the results. The renders lie in it, so that a render that is kept is only renamed.
-        on_event: called with each event: a step that begins, the fraction of samples that is done, the report of a
-            frame that ended, or the ordinary render that it is compared with.
+        on_event: called with each event: a step that begins, the fraction of samples that is done, or the report of a
+            frame that ended.
         fuse: called with the files of both renders of each frame, or twice that of its only render. Its errors name
             the frame.
         verbose: pass on the messages of Blender.

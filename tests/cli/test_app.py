@@ -63,7 +63,7 @@ SHOWN = {
     ),
     "msspl_render": (
         "--view-layer --max-memory --blender --renders --scale --lr-spp --hr-spp --components --quality --device "
-        "--output --layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
+        "--output --layout --passes --error-layer --overwrite --json --frames --temporal --skip-existing "
         "--help --help-all --version",
         11,
     ),

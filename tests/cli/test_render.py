@@ -100,13 +100,12 @@ for number, output in job["frames"]:
 
 @pytest.fixture
 def farm(tmp_path):
-    """Return functions that run msspl-render with a stand-in for Blender, which does ``code`` while it renders, and
-    ``after`` at its end."""
+    """Return functions that run msspl-render with a stand-in for Blender, which does ``code`` while it renders."""
     (tmp_path / "scene.blend").write_text("")
 
-    def start_render(*arguments, code="pass", after="", stderr=subprocess.PIPE):
+    def start_render(*arguments, code="pass", stderr=subprocess.PIPE):
         blender = tmp_path / "blender"
-        blender.write_text(f"#!{sys.executable}\n{FAKE.replace('{code}', code)}{after}")
+        blender.write_text(f"#!{sys.executable}\n{FAKE.replace('{code}', code)}")
         blender.chmod(0o755)
         main = "import sys; from msspl_cli.app import msspl_render as main; sys.argv[0] = 'msspl-render'; main()"
         command = [sys.executable, "-c", main, "scene.blend", "-o", "out.exr", "-s", "4"]
@@ -390,16 +389,6 @@ def test_renders_that_cannot_be_fused_are_kept_and_named(farm, model):
 
 
 @posix
-def test_frames_are_compared_after_the_last_one(farm):
-    """Blender tells of each ordinary render, which then belongs to the frame's report."""
-    _, run, _ = farm
-    told = "for n in (1, 2): tell(frame=n, oidn=dict(spp=n + 4, seconds=2.4, file=f'{n}_oidn.exr'))"
-    code, out, _, _ = run("-o", "out.##.exr", "--frames", "1-2", "--compare", "--json", after=told)
-    assert code == 0
-    assert [(report["frame"], report["oidn"]["spp"]) for report in json.loads(out)] == [(1, 5), (2, 6)]
-
-
-@posix
 @pytest.mark.parametrize(
     ("arguments", "code", "status", "message"),
     [
@@ -490,10 +479,10 @@ def test_a_python_without_bpy_is_the_callers_mistake(farm, said):
 @posix
 def test_nothing_is_overwritten_unasked(farm):
     _, run, folder = farm
-    (folder / "out_oidn.exr").write_text("old")
-    code, _, err, _ = run("--compare")
-    assert (code, err) == (2, "error: out_oidn.exr: exists; pass --overwrite to replace it\n")
-    assert run("--compare", "--overwrite")[0] == 0
+    (folder / "out_hr.exr").write_text("old")
+    code, _, err, _ = run("--keep")
+    assert (code, err) == (2, "error: out_hr.exr: exists; pass --overwrite to replace it\n")
+    assert run("--keep", "--overwrite")[0] == 0
 
 
 @posix

@@ -34,7 +34,7 @@ EXAMPLES = """[bold]Examples[/bold]
 
   msspl-render scene.blend -o frame.exr --blender /opt/blender-5.0/blender
 
-  msspl-render scene.blend -o frame.exr --keep --compare --json > times.json
+  msspl-render scene.blend -o frame.exr --keep --json > times.json
 """
 
 #: Group of options in the help text.
@@ -91,9 +91,6 @@ def render(
     trust: options.Trust = "on",
     trust_layer: options.TrustLayer = False,
     keep: Annotated[bool, option(OUTPUT, _KEEP, "--keep", hidden=True)] = False,
-    compare: Annotated[
-        bool, option(OUTPUT, "Also render the ordinary way, with OIDN, in the same time: OUT_oidn.exr.", "--compare")
-    ] = False,
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     # Shot
@@ -128,8 +125,7 @@ def render(
         raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
     shot = name_targets(output, frames)
     targets = [path for _, path in shot if not (skip_existing and path.exists())]
-    names = [*(suffixes(renders, scale) if keep else ()), *(["oidn"] if compare else ())]
-    extras = [beside(path, name) for path in targets for name in names]
+    extras = [beside(path, name) for path in targets for name in suffixes(renders, scale)] if keep else []
     _check_files(scene, output, targets, extras, overwrite=overwrite, skip_existing=skip_existing)
     use_threads(threads)
     added: dict[str, Any] = {"error_layer": error_layer, "trust_layer": trust_layer, "data_passes": data_passes}
@@ -164,7 +160,6 @@ def render(
             "threads": threads,
         },
         "overwrite": overwrite,
-        "compare": compare,
     }
     atomic.make_folder(output.parent)
     atomic.remove_leftovers(path for _, path in shot)
@@ -258,8 +253,6 @@ class _Printer:
             done = self._done + self._fraction + event.get("samples", 0) / (len(self._shot.suffixes) + 1)
             self._bar.update(self._label, done, len(self._shot.order))
         self._add_written()
-        if "oidn" in event:
-            next(report for report in self._reports if report["frame"] == event["frame"])["oidn"] = event["oidn"]
 
     def _add_written(self) -> None:
         """Keep the reports of frames that are written, and print their warnings."""
@@ -292,7 +285,7 @@ class _Printer:
 
 
 def _print_times(reports: Sequence[dict[str, Any]], *, alone: bool) -> None:
-    """Print the time of each step and, if it is known, what ordinary rendering gives in the time of the frame.
+    """Print the time of each step and, without neighbours, what ordinary rendering gives in the time of the frame.
 
     The time of a frame that is averaged does not tell, because it holds the work for frames that waited for it.
     """
@@ -301,15 +294,10 @@ def _print_times(reports: Sequence[dict[str, Any]], *, alone: bool) -> None:
         print(f"{render['name']} {render['size'][0]}x{render['size'][1]}, {render['spp']} spp")
     names = [f"{render['name']} s" for render in first["renders"]]
     titles = ("frame", *names, "fuse s", "all s", "plain rendering in that time")
-    columns = len(titles) if alone or any("oidn" in report for report in reports) else len(titles) - 1
+    columns = len(titles) if alone else len(titles) - 1
     rows: list[tuple[str, ...]] = [titles[:columns]]
     for report in reports:
-        oidn = report.get("oidn")
-        plain = (
-            f"{oidn['spp']} spp and OIDN, {oidn['seconds']:.2f} s: {oidn['file']}"
-            if oidn
-            else f"about {report['plain_spp']:.1f} spp"
-        )
+        plain = f"about {report['plain_spp']:.1f} spp"
         seconds = *(render["seconds"] for render in report["renders"]), report["fuse_seconds"], report["seconds"]
         rows.append((str(report["frame"]), *(f"{value:.2f}" for value in seconds), plain)[:columns])
     console.table(rows, header=True)

@@ -14,7 +14,7 @@ from . import render_settings
 from .checks import check_scene
 from .errors import Failure
 from .frame import Progress, loaded_once, render_and_fuse, run_to_end
-from .options import Options, find_view_layer, hrls_size
+from .options import Options, find_view_layer, frame_size
 from .overrides import override
 
 #: Prints a message for msspl-render, given as keyword arguments.
@@ -50,7 +50,7 @@ def run_job(job: dict[str, Any], send: Send, receive: Callable[[], None]) -> Non
                 scene.frame_set(number)
             if index == 0:
                 check_scene(scene, options)
-                send(size=hrls_size(scene), **_passes(scene, options))
+                send(size=frame_size(scene), **_passes(scene, options))
             if output is not None or options.vectors:
                 report = _run_frame(scene, options, job, output, send, receive)
                 if output is not None:

@@ -8,7 +8,7 @@ from typing import Any
 from bpy.types import Scene
 
 from .errors import Failure
-from .options import Options, find_view_layer, hrls_size, lrhs_size, view_layer_path
+from .options import Options, find_view_layer, frame_size, view_layer_path
 from .overrides import read
 
 
@@ -25,8 +25,8 @@ def check_scene(scene: Scene, options: Options) -> None:
         raise Failure(f"scene '{scene.name}' is stereoscopic; turn Stereoscopy off and render one view at a time")
     if render.use_freestyle:
         raise Failure(f"scene '{scene.name}' draws Freestyle lines, which are no noise to remove; turn Freestyle off")
-    if min(lrhs_size(scene, options.scale)) < 4:  # Blender renders no smaller image.
-        width, height = hrls_size(scene)
+    if min(frame_size(scene, options.scale)) < 4:  # Blender renders no smaller image.
+        width, height = frame_size(scene)
         raise Failure(f"{width}x{height} is too small for x{options.scale}; use a smaller scale or a larger frame")
     find_view_layer(scene, options)
 

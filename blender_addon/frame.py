@@ -17,7 +17,7 @@ from bpy.types import Scene
 from . import render_settings
 from .checks import check_animation, check_output, check_scene
 from .errors import Failure
-from .options import Options, hrls_size, lrhs_size
+from .options import Options, frame_size
 from .overrides import find_scene, override
 from .render import escape_path, render
 
@@ -137,8 +137,8 @@ def loaded_once(scene: Scene) -> Iterator[None]:
 def _input_renders(scene: Scene, options: Options, work: Path) -> list[tuple[InputRender, dict[str, Any]]]:
     """Return the renders that are fused, each with its settings."""
     names = ["LRHS", "HRLS"] if options.scale > 1 else ["render 1", "render 2"] if options.renders > 1 else ["render"]
-    low = InputRender(names[0], lrhs_size(scene, options.scale), options.lrhs_spp, str(work / "lr.exr"))
-    full = InputRender(names[-1], hrls_size(scene), options.hrls_spp, str(work / "hr.exr"))
+    low = InputRender(names[0], frame_size(scene, options.scale), options.lrhs_spp, str(work / "lr.exr"))
+    full = InputRender(names[-1], frame_size(scene), options.hrls_spp, str(work / "hr.exr"))
     inputs = [(low, render_settings.lrhs(scene, options)), (full, render_settings.hrls(scene, options))]
     return inputs[-options.renders :]
 

@@ -46,15 +46,10 @@ class Options:
         return self.lr_spp or -(-(self.scale**2) * max(3, self.hrls_spp) // 3)
 
 
-def hrls_size(scene: Scene) -> tuple[int, int]:
-    """Return (width, height) of the frame."""
+def frame_size(scene: Scene, scale: int = 1) -> tuple[int, int]:
+    """Return (width, height) in pixels of the frame, or of its LRHS, rounded up so that it covers the whole frame."""
     render, percent = scene.render, scene.render.resolution_percentage
-    return render.resolution_x * percent // 100, render.resolution_y * percent // 100
-
-
-def lrhs_size(scene: Scene, scale: int) -> tuple[int, int]:
-    """Return (width, height) of the LRHS, rounded up so that it covers the whole frame."""
-    width, height = hrls_size(scene)
+    width, height = render.resolution_x * percent // 100, render.resolution_y * percent // 100
     return -(-width // scale), -(-height // scale)
 
 

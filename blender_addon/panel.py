@@ -7,7 +7,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 from bpy.types import Context
 
-from .options import Options, hrls_size, lrhs_size
+from .options import Options, frame_size
 
 #: The current step of the running job; without a text, no job runs. A Blender property would be saved in the .blend.
 status = SimpleNamespace(text="", fraction=0.0)
@@ -129,9 +129,9 @@ class MSSPL_PT_fuse(bpy.types.Panel):
         choices = ("quality", "device", "filter", "components", "average", "output", "connect")
         for name in ("renders", *small, "hr_spp", *choices):
             layout.prop(settings, name)
-        inputs = [(hrls_size(scene), options.hrls_spp)]
+        inputs = [(frame_size(scene), options.hrls_spp)]
         if options.renders > 1:
-            inputs.insert(0, (lrhs_size(scene, options.scale), options.lrhs_spp))
+            inputs.insert(0, (frame_size(scene, options.scale), options.lrhs_spp))
         layout.label(text=", ".join(f"{width}x{height} at {spp} spp" for (width, height), spp in inputs))
         if status.text:
             layout.progress(text=status.text, factor=status.fraction)

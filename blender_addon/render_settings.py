@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 from bpy.types import Scene
 
-from .options import Options, find_view_layer, hrls_size, lrhs_size, view_layer_path
+from .options import Options, find_view_layer, frame_size, view_layer_path
 
 BLENDER_5 = bpy.app.version >= (5, 0, 0)
 
@@ -31,7 +31,7 @@ _FIRST_SEED = 1009
 
 def lrhs(scene: Scene, options: Options) -> dict[str, Any]:
     """Return the settings of the first of two renders. It is the LRHS, unless the scale is 1."""
-    (width, height), (full_width, full_height) = lrhs_size(scene, options.scale), hrls_size(scene)
+    (width, height), (full_width, full_height) = frame_size(scene, options.scale), frame_size(scene)
     aspect_x, aspect_y = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
     # The size is rounded up, so the pixel aspect is adjusted until the LRHS shows exactly the frame.
     aspect_x *= (full_width * height) / (full_height * width)
@@ -50,7 +50,7 @@ def lrhs(scene: Scene, options: Options) -> dict[str, Any]:
 
 def hrls(scene: Scene, options: Options) -> dict[str, Any]:
     """Return the settings of the HRLS, or of the last or only render of the frame's size."""
-    width, height = hrls_size(scene)
+    width, height = frame_size(scene)
     return _common(scene, options) | {
         "render.resolution_x": width,
         "render.resolution_y": height,

@@ -139,7 +139,12 @@ def _run(
             while process.poll() is None:
                 yield progress(log)
         finally:
-            _end(process)
+            process.terminate()  # which does nothing if the program has ended
+            try:
+                process.wait(_GRACE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
     if process.returncode:
         lines = _read(log).strip().splitlines() or [f"the program ended with code {process.returncode}"]
         said = next((line for line in lines if line.startswith("error: ")), lines[-1])
@@ -160,13 +165,3 @@ def _written(path: str) -> int | None:
 
 def _read(path: Path) -> str:
     return path.read_text(encoding="utf-8", errors="replace")
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(_GRACE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()

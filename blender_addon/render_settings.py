@@ -99,8 +99,12 @@ def _common(scene: Scene, options: Options) -> dict[str, Any]:
         "render.image_settings.color_mode": "RGBA",
         "render.image_settings.color_depth": image.color_depth if image.file_format.startswith("OPEN_EXR") else "16",
         "render.image_settings.exr_codec": "ZIP",
-        **_colour_space(scene),
+        # An override, or else the space in which the scene is rendered.
+        "render.image_settings.color_management": "OVERRIDE" if linear_override(scene) else "FOLLOW_SCENE",
     }
+    name = image.linear_colorspace_settings.name
+    if name:  # Blender can change it when the file format is set. It is empty if the configuration lacks it.
+        values["render.image_settings.linear_colorspace_settings.name"] = name
     if BLENDER_5:  # Blender 5.0 cannot write several parts if the pixels are not square.
         values["render.image_settings.use_exr_interleave"] = True
     return values
@@ -112,12 +116,3 @@ def linear_override(scene: Scene) -> str:
     name = image.linear_colorspace_settings.name
     overridden = image.color_management == "OVERRIDE" and image.has_linear_colorspace
     return name if overridden and _LINEAR.search(name) else ""
-
-
-def _colour_space(scene: Scene) -> dict[str, Any]:
-    """Return the colour space of the file: an override, or else the space in which the scene is rendered."""
-    values = {"render.image_settings.color_management": "OVERRIDE" if linear_override(scene) else "FOLLOW_SCENE"}
-    name = scene.render.image_settings.linear_colorspace_settings.name
-    if name:  # Blender can change it when the file format is set. It is empty if the configuration lacks it.
-        values["render.image_settings.linear_colorspace_settings.name"] = name
-    return values

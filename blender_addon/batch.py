@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Renders and fuses a list of frames without a window, as :mod:`.headless` gets them from msspl-render."""
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import nullcontext
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from bpy.types import Scene
 from . import render_settings
 from .checks import check_scene
 from .errors import Failure
-from .frame import Progress, loaded_once, render_and_fuse, run_to_end
+from .frame import Progress, Report, loaded_once, render_frame
 from .options import Options, find_view_layer, frame_size
 from .overrides import override
 
@@ -48,13 +48,12 @@ def run_job(job: dict[str, Any], send: Send, receive: Callable[[], None]) -> Non
         for index, (number, output) in enumerate(job["frames"]):
             if number is not None:
                 scene.frame_set(number)
+            check_scene(scene, options)
             if index == 0:
-                check_scene(scene, options)
                 send(size=frame_size(scene), **_passes(scene, options))
             if output is not None or options.vectors:
-                report = _run_frame(scene, options, job, output, send, receive)
-                if output is not None:
-                    send(report=report)
+                for step, fraction in _run_frame(scene, options, Path(job["work"]), output, send, receive):
+                    send(frame=scene.frame_current, step=step, fraction=fraction)
 
 
 def _open_scene(file: str, name: str) -> None:
@@ -86,25 +85,18 @@ def _passes(scene: Scene, options: Options) -> dict[str, Any]:
 
 
 def _run_frame(
-    scene: Scene, options: Options, job: dict[str, Any], output: str | None, send: Send, receive: Callable[[], None]
-) -> dict[str, Any]:
+    scene: Scene, options: Options, work: Path, output: str | None, send: Send, receive: Callable[[], None]
+) -> Iterator[Progress]:
     """Render a frame and have it fused. A frame without an output is rendered for its neighbours."""
     number = scene.frame_current
-    work = Path(job["work"], str(number))
-    work.mkdir()
-
-    def on_step(step: str, fraction: float) -> None:
-        send(frame=number, step=step, fraction=fraction)
-
-    def fuse(renders: Sequence[str], before: float, output: str) -> Generator[Progress, None, dict[str, Any]]:
-        yield "fuse", before
-        send(fuse=renders)  # msspl-render keeps its model loaded
-        receive()
-        return {"warnings": []}  # msspl-render has its own, and may not have written this frame yet
-
-    on_step("start", 0.0)
-    steps = render_and_fuse(
-        scene, options, Path(output or work / "none.exr"), work, fuse, nullcontext(), overwrite=job["overwrite"]
-    )
-    report = run_to_end(steps, on_step)
-    return {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
+    folder = work / str(number)
+    folder.mkdir()
+    renders = yield from render_frame(scene, options, folder)
+    yield "fuse", len(renders) / (len(renders) + 1)
+    start = time.perf_counter()
+    send(fuse=[part.file for part in renders])  # msspl-render keeps its model loaded
+    receive()
+    if output is not None:
+        # msspl-render has warnings of its own, and may not have written this frame yet.
+        report = Report(output, renders, time.perf_counter() - start, warnings=[])
+        send(report={"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)})

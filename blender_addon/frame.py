@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes one frame: renders it once or twice, and fuses the renders.
+"""Renders one frame once or twice, and reports on it.
 
 A job is a generator that yields its progress, so that a window stays responsive. Closing the generator cancels the job.
 However the job ends, the scene gets its own settings back.
 """
 
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,17 +15,14 @@ from typing import Any
 from bpy.types import Scene
 
 from . import render_settings
-from .checks import check_animation, check_output, check_scene
+from .checks import check_animation
 from .errors import Failure
 from .options import Options, frame_size
 from .overrides import find_scene, override
-from .render import escape_path, render
+from .render import render
 
 #: The current step, and the fraction of the work that is done.
 Progress = tuple[str, float]
-#: Fuses the files of one or two renders into another one, and returns a dictionary with ``warnings``. The second
-#: argument is the progress before it.
-Fuse = Callable[[Sequence[str], float, str], Generator[Progress, None, dict[str, Any]]]
 
 
 @dataclass
@@ -78,49 +75,36 @@ class Report:
         return f"{times}fuse {self.fuse_seconds:.1f} s; {same_time}"
 
 
-def render_and_fuse(
-    scene: Scene,
-    options: Options,
-    output: Path,
-    work: Path,
-    fuse: Fuse,
-    loaded: AbstractContextManager[None],
-    *,
-    overwrite: bool = False,
-    window: bool = False,
-) -> Generator[Progress, None, Report]:
-    """Render and fuse a frame, yield the progress, and return a :class:`Report`.
+def render_frame(
+    scene: Scene, options: Options, work: Path, *, window: bool = False
+) -> Generator[Progress, None, list[InputRender]]:
+    """Render a frame once or twice, yield the progress, and return the renders. The fusion counts as one step more.
 
     Args:
         work: a folder for the renders, which stay there.
-        loaded: entered while frames are rendered: :func:`loaded_once`, or nothing if the caller is inside of it.
         window: let Blender go on while it renders. The caller must then return to Blender's event loop between steps.
 
     Raises:
-        Failure, Cancelled: no output was written.
+        Failure, Cancelled: a render is missing.
     """
-    check_output(output, overwrite)
-    check_scene(scene, options)
     to_render = _input_renders(scene, options, work)
     identity, moment = (scene.name, scene.session_uid), (scene.frame_current, scene.frame_subframe)
-    steps = len(to_render) + 1
-    with loaded:
-        for index, (part, values) in enumerate(to_render):
-            yield str(part), index / steps
-            scene = find_scene(*identity)
-            if (scene.frame_current, scene.frame_subframe) != moment:
-                raise Failure(
-                    f"the scene went from frame {moment[0]} to {scene.frame_current} during the render; render again"
-                )
-            start = time.perf_counter()
-            with override(scene, values | {"render.filepath": escape_path(part.file)}):
-                check_animation(scene, values)
-                for _ in render(scene, part.file, window=window):
-                    yield str(part), index / steps
-            part.seconds = time.perf_counter() - start
-    start, renders = time.perf_counter(), [part for part, _ in to_render]
-    fused = yield from fuse([part.file for part in renders], (steps - 1) / steps, str(output))
-    return Report(str(output), renders, time.perf_counter() - start, fused["warnings"])
+    for index, (part, values) in enumerate(to_render):
+        progress = str(part), index / (len(to_render) + 1)
+        yield progress
+        scene = find_scene(*identity)
+        if (scene.frame_current, scene.frame_subframe) != moment:
+            raise Failure(
+                f"the scene went from frame {moment[0]} to {scene.frame_current} during the render; render again"
+            )
+        start = time.perf_counter()
+        escaped = part.file.replace("{", "{{").replace("}", "}}")  # Blender takes {name} for a variable.
+        with override(scene, values | {"render.filepath": escaped}):
+            check_animation(scene, values)
+            for _ in render(scene, part.file, window=window):
+                yield progress
+        part.seconds = time.perf_counter() - start
+    return [part for part, _ in to_render]
 
 
 @contextmanager
@@ -141,14 +125,3 @@ def _input_renders(scene: Scene, options: Options, work: Path) -> list[tuple[Inp
     full = InputRender(names[-1], frame_size(scene), options.hrls_spp, str(work / "hr.exr"))
     inputs = [(low, render_settings.lrhs(scene, options)), (full, render_settings.hrls(scene, options))]
     return inputs[-options.renders :]
-
-
-def run_to_end(job: Generator[Progress, None, Report], on_step: Callable[[str, float], None]) -> Report:
-    """Run a job without a window and return its report. The progress of each step goes to ``on_step``."""
-    while True:
-        try:
-            progress = next(job)
-        except StopIteration as end:
-            return end.value
-        on_step(*progress)
-        time.sleep(0.02)

@@ -12,7 +12,6 @@ The job is a JSON object:
                rendered because its neighbours need it
     work       folder for temporary files, on the same file system as the results
     options    fields of :class:`.options.Options`
-    overwrite  replace results that exist
 
 Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON object. After the line
 ``MSSPL {"fuse": [file]}``, or two files, msspl-render fuses these renders, and deletes them when no frame needs them

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Runs the two buttons, for a frame and for an animation: step by step in a window, blocking in a script."""
 
-import functools
 import re
 import tempfile
 import time
@@ -12,7 +11,7 @@ import bpy
 from bpy.types import Context, Event, Scene
 
 from . import compositor, frame, overrides, programs
-from .checks import check_scene
+from .checks import check_output, check_scene
 from .errors import Cancelled, Failure
 from .panel import status
 
@@ -130,15 +129,18 @@ class MSSPL_OT_fuse(_Job, bpy.types.Operator):
         path = _numbered(_output(scene, options.view_layer), scene.frame_current)
         if path.startswith("//") and not bpy.data.filepath:
             raise Failure(f"{path}: save the .blend first, or give a full path")
+        output = bpy.path.abspath(path)
+        check_output(Path(output), overwrite)
+        check_scene(scene, options)
+        more = [*programs.model_options(scene), *(["--overwrite"] if overwrite else [])]
         with tempfile.TemporaryDirectory(prefix="msspl-") as name:
-            work, output = Path(name), Path(bpy.path.abspath(path))
-            more = [*programs.model_options(scene), *(["--overwrite"] if overwrite else [])]
-            fuse = functools.partial(programs.fuse, program, more, work)
-            loaded = frame.loaded_once(scene)
-            report = yield from frame.render_and_fuse(
-                scene, options, output, work, fuse, loaded, overwrite=overwrite, window=window
-            )
-        self._finish(overrides.find_scene(*identity), options.view_layer, path, report.warnings, f"{path}: {report}")
+            work = Path(name)
+            with frame.loaded_once(scene):
+                renders = yield from frame.render_frame(scene, options, work, window=window)
+            start = time.perf_counter()
+            warnings = yield from programs.fuse(program, more, work, [part.file for part in renders], output)
+            report = frame.Report(path, renders, time.perf_counter() - start, warnings)
+        self._finish(overrides.find_scene(*identity), options.view_layer, path, warnings, f"{path}: {report}")
 
 
 class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):

@@ -49,14 +49,13 @@ def find_render(preference: str = "") -> str:
 
 
 def fuse(
-    program: str, options: Sequence[str], work: Path, renders: Sequence[str], before: float, output: str
-) -> Generator[Progress, None, dict[str, Any]]:
-    """Fuse one render or two, and return the report of msspl-fuse.
+    program: str, options: Sequence[str], work: Path, renders: Sequence[str], output: str
+) -> Generator[Progress, None, list[str]]:
+    """Fuse one render or two, and return the warnings of msspl-fuse.
 
     Args:
         program: of :func:`find_fuse`.
         work: a folder for temporary files.
-        before: the progress before it.
 
     Raises:
         Failure: msspl-fuse failed. The message is its own.
@@ -67,9 +66,11 @@ def fuse(
 
     def progress(log: Path) -> Progress:
         steps = _STEP.findall(_read(log))
-        return "fuse", before + (1 - before) * (int(steps[-1][0]) / int(steps[-1][1]) if steps else 0)
+        done = int(steps[-1][0]) / int(steps[-1][1]) if steps else 0
+        return "fuse", (len(renders) + done) / (len(renders) + 1)
 
-    return (yield from _run("msspl-fuse", command, work, progress))
+    report = yield from _run("msspl-fuse", command, work, progress)
+    return report["warnings"]
 
 
 def render_shot(

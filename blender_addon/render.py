@@ -33,8 +33,3 @@ def render(scene: Scene, file: str, *, window: bool = False) -> Iterator[None]:
         if bpy.app.background:
             raise Failure(f"{file}: Blender wrote no file", 1)
         raise Cancelled
-
-
-def escape_path(path: str) -> str:
-    """Double the braces of a path for ``render.filepath``, where Blender takes ``{name}`` for a variable."""
-    return path.replace("{", "{{").replace("}", "}}")

@@ -159,7 +159,6 @@ def render(
             "vectors": fused.plan.count > 0,
             "threads": threads,
         },
-        "overwrite": overwrite,
     }
     atomic.make_folder(output.parent)
     atomic.remove_leftovers(path for _, path in shot)

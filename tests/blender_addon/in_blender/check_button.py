@@ -158,9 +158,9 @@ def check_modes(scene):
         modes.append(window)
         raise errors.Failure("no more")
 
-    module("frame").render_and_fuse, real = fail, module("frame").render_and_fuse
+    module("frame").render_frame, real = fail, module("frame").render_frame
     assert "no more" in sentence()
-    module("frame").render_and_fuse = real
+    module("frame").render_frame = real
     assert modes[3:] == [False]
 
 

@@ -82,7 +82,7 @@ def check_loaded_once(scene):
     """The renders of a job share the scene that is loaded."""
     work = WORK / "job"
     work.mkdir()
-    job = {"scene": "", "scene_name": "", "work": str(work), "overwrite": True}
+    job = {"scene": "", "scene_name": "", "work": str(work)}
     job["options"] = {"renders": 2, "scale": 2, "view_layer": "ViewLayer"}
     job["frames"] = [(number, str(WORK / f"job_{number}.exr")) for number in (1, 2, 3)]
     reports = []

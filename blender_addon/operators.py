@@ -43,14 +43,10 @@ class _Job:
         return result
 
     def invoke(self, context: Context, event: Event) -> set[str]:
+        self._steps = self._job(context, window=True)
+        self._timer = context.window_manager.event_timer_add(0.1, window=context.window)
+        context.window_manager.modal_handler_add(self)
         status.text = "starting"
-        self._steps, self._timer = self._job(context, window=True), None
-        try:
-            self._timer = context.window_manager.event_timer_add(0.1, window=context.window)
-            context.window_manager.modal_handler_add(self)
-        except BaseException:
-            self.cancel(context)
-            raise
         return {"RUNNING_MODAL"}
 
     def modal(self, context: Context, event: Event) -> set[str]:
@@ -78,8 +74,7 @@ class _Job:
     def cancel(self, context: Context) -> None:
         """Cancel the job and clean up. Blender also calls this when another file is opened."""
         try:
-            if self._timer is not None:
-                context.window_manager.event_timer_remove(self._timer)
+            context.window_manager.event_timer_remove(self._timer)
             context.workspace.status_text_set(None)
         finally:
             self._end()

@@ -12,13 +12,13 @@ A checkpoint is a dictionary that ``torch.save`` wrote:
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from oiio_msspl.exr.atomic import replacing
 from research.training.joint import JointFusion
 from research.training.paper import MultiResolutionFusion
 
@@ -41,9 +41,8 @@ def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | 
 
 def save(state: State | list[Any], path: Path) -> None:
     """Write a file whole or not at all, because a run may be killed at any time."""
-    partial = path.with_suffix(".partial")
-    torch.save(state, partial)
-    os.replace(partial, path)
+    with replacing(path, overwrite=True) as temporary:
+        torch.save(state, temporary)
 
 
 def read(path: Path) -> State:

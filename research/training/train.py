@@ -50,8 +50,6 @@ PATCH = {2: 64, 4: 96, 8: 128}
 #: A step is skipped if its gradient is this many times longer than usual. One bad batch could undo a run in spite of
 #: clipping, because Adam divides it by the small gradients before it.
 SPIKE = 4.0
-#: A run that falls this many dB behind its best checkpoint returns to it, with half the learning rate.
-COLLAPSE = 2.0
 #: Share of the run in which the learning rate rises.
 WARM_UP = 0.03
 #: Largest decay of the averaged weights.
@@ -116,13 +114,15 @@ class Run:
     """A training run: its networks, optimiser and checkpoints. :func:`parse` describes ``args``."""
 
     def __init__(self, args: argparse.Namespace) -> None:
+        torch.set_num_threads(args.threads)
+        torch.manual_seed(args.seed)
+        args.out.mkdir(parents=True, exist_ok=True)
         self.args = args
         self.scales = tuple(args.scale)
         self.patch = args.patch or max(PATCH[scale] for scale in self.scales)
-        self.peak_lr = args.lr
         self.device = torch.device(args.device)
         torch.backends.cudnn.benchmark = True  # batches of a scale have one size
-        self.checkpoint_path, self.best_path = args.out / "checkpoint.pt", args.out / "best.pt"
+        self.checkpoint_path = args.out / "checkpoint.pt"
         self.step, self.elapsed, self.best_psnr = 0, 0.0, -math.inf
 
         # Data
@@ -151,10 +151,13 @@ class Run:
             checkpoints.warm_start(self.network, args.init)
         self.network.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = averaged(self.network)
-        groups = parameter_groups(self.network, args.fine_tune, self.peak_lr)
-        self.optimizer = torch.optim.AdamW(groups, lr=self.peak_lr, eps=EPS)
+        groups = parameter_groups(self.network, args.fine_tune, args.lr)
+        self.optimizer = torch.optim.AdamW(groups, lr=args.lr, eps=EPS)
         if state is not None:
-            self.restore(state)
+            self.network.load_state_dict(state["network"])
+            self.average.module.load_state_dict(state["ema"])
+            self.average.n_averaged.fill_(1 + state["step"])
+            self.optimizer.load_state_dict(state["optimizer"])
             self.step, self.elapsed = state["step"], state["seconds"]
             self.best_psnr = state["best_psnr"]
             log.info("continues at step %d, minute %.1f", self.step, self.elapsed / 60)
@@ -173,16 +176,9 @@ class Run:
     def new_schedule(self) -> LambdaLR:
         """Set the learning rate by the clock, at every ``step()`` of the schedule."""
         for group in self.optimizer.param_groups:
-            group["initial_lr"] = self.peak_lr * group["share"]
+            group["initial_lr"] = self.args.lr * group["share"]
         budget = max(self.args.minutes * 60, 1e-9)
         return LambdaLR(self.optimizer, lambda _: lr_factor(self.elapsed / budget, self.args.final_lr))
-
-    def restore(self, state: checkpoints.State) -> None:
-        """Return to the weights and the optimiser of a checkpoint."""
-        self.network.load_state_dict(state["network"])
-        self.average.module.load_state_dict(state["ema"])
-        self.average.n_averaged.fill_(1 + state["step"])
-        self.optimizer.load_state_dict(state["optimizer"])
 
     def reset_statistics(self) -> None:
         """Start to count anew, for the next line of the log."""
@@ -232,29 +228,17 @@ class Run:
         return length if math.isinf(usual) else 0.98 * usual + 0.02 * min(length, SPIKE * usual)
 
     def checkpoint(self) -> None:
-        """Evaluate, log a line and write the state; return to the best checkpoint if training has collapsed."""
-        scores = self.evaluate()
+        """Score the averaged weights on the validation views, log a line and write the state."""
+        scores = evaluate(cast(Network, self.average.module), self.validation, self.device)
         self.log_row(scores)
-        psnr = scores.get("psnr", math.nan)
-        if scores and self.best_path.exists() and not psnr >= self.best_psnr - COLLAPSE:  # or it is NaN
-            self.peak_lr /= 2
-            self.restore(checkpoints.read(self.best_path))
-            self.schedule = self.new_schedule()
-            message = "collapsed to %.1f dB, back to %.1f dB, peak learning rate %.2g"
-            log.warning(message, psnr, self.best_psnr, self.peak_lr)
-        else:
-            better = not scores or psnr > self.best_psnr  # without validation views the newest is the best
-            if better and scores:
-                self.best_psnr = psnr
-            state = self.state(scores)
-            if better:
-                checkpoints.save(state, self.best_path)
-            checkpoints.save(state, self.checkpoint_path)
+        better = not scores or scores["psnr"] > self.best_psnr  # without validation views the newest is the best
+        if better and scores:
+            self.best_psnr = scores["psnr"]
+        state = self.state(scores)
+        if better:
+            checkpoints.save(state, self.args.out / "best.pt")
+        checkpoints.save(state, self.checkpoint_path)
         self.reset_statistics()
-
-    def evaluate(self) -> dict[str, float]:
-        """Score the averaged weights on the validation views."""
-        return evaluate(cast(Network, self.average.module), self.validation, self.device)
 
     def log_row(self, scores: dict[str, float]) -> None:
         """Append a line to ``log.csv``."""
@@ -284,14 +268,6 @@ class Run:
             "training_spp": {str(scale): spp_range(self.views, scale) for scale in self.scales},
             "provenance": provenance,
         }  # fmt: skip
-
-
-def train(args: argparse.Namespace) -> None:
-    """Train a network; :func:`parse` describes the arguments."""
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed)
-    args.out.mkdir(parents=True, exist_ok=True)
-    Run(args).train()
 
 
 def write_row(path: Path, row: dict[str, float]) -> None:
@@ -343,4 +319,4 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    train(parse())
+    Run(parse()).train()

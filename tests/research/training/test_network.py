@@ -310,8 +310,8 @@ def test_the_loader_draws_what_the_data_set_does(views: Path) -> None:
 
 def test_the_schedule_follows_the_clock() -> None:
     """Warm-up from 0, the peak, the end of the cosine; a group's share scales it."""
-    run = Mock(spec_set=["optimizer", "peak_lr", "args", "elapsed"], peak_lr=1e-3, elapsed=0.0)
-    run.args.minutes, run.args.final_lr = 1, 0.2
+    run = Mock(spec_set=["optimizer", "args", "elapsed"], elapsed=0.0)
+    run.args.lr, run.args.minutes, run.args.final_lr = 1e-3, 1, 0.2
     run.optimizer = torch.optim.SGD([{"params": [torch.zeros(1)], "share": 0.5}], lr=1.0)
     schedule = train.Run.new_schedule(run)
     for elapsed, share in ((0.0, 1e-3), (0.9, 0.5), (1.8, 1.0), (60.0, 0.2)):

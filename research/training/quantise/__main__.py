@@ -31,7 +31,7 @@ from research.training.denoisers import FullSizeDenoiser, LayerDenoisers, mean_i
 from research.training.encoding import log_decode, log_encode
 from research.training.oidn import FineTunedUNet, provenance
 from research.training.quantise.codes import OUTPUT_SLICES, denoiser_codes, full_size_codes, log_encoded_of_code
-from research.training.quantise.gptq import Fit, quantise_full_size_denoiser, quantise_mean_denoiser
+from research.training.quantise.gptq import quantise_denoiser
 from research.training.quantise.graph import Graph
 from research.training.quantise.layers import varied
 from research.training.render_mean import with_mean
@@ -77,18 +77,18 @@ def main() -> None:
     exact: FineTunedUNet | None
     images: Callable[[Path, str, int], Iterator[Images]]
     codes: Callable[..., Tensor]
-    quantise: Callable[..., Fit]
     if args.full_size:
         exact, shipped, images = FullSizeDenoiser(), FULL_SIZE_DENOISER, single_renders
-        codes, quantise = full_size_codes, quantise_full_size_denoiser
+        codes = full_size_codes
     else:
         joint, _ = load_joint(args.checkpoint)
         exact, images = joint.mean_denoiser, means
         shipped = CHECKPOINTS / f"{denoiser_file(joint.denoiser(SCALES[0]))}.onnx"
-        codes, quantise = denoiser_codes, quantise_mean_denoiser
+        codes = denoiser_codes
     if exact is None:
         raise SystemExit(f"{args.checkpoint}: the size large has no denoiser of both renders' mean of its own")
-    fit = quantise(exact.shape, exact.weights(), [codes(*inputs) for inputs in images(args.views, "train", IMAGES)])
+    calibration = [codes(*inputs) for inputs in images(args.views, "train", IMAGES)]
+    fit = quantise_denoiser(exact.shape, exact.weights(), calibration, full_size=args.full_size)
     model, path = Graph(fit).model(), args.output or shipped
     helper.set_model_props(model, {"provenance": json.dumps(provenance(exact.network))})
     onnx.save(model, path)

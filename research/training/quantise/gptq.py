@@ -165,7 +165,8 @@ class Fit:
     def conv(self, name: str, inputs: Activations) -> Activations:
         """Quantise a convolution; return its outputs."""
         weights, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
-        rectified = self._rectified(name, len(bias))
+        # So many outputs, the first ones, pass a ReLU. The others are signed.
+        rectified = 0 if name in HEADS else COLOURS if name == self.shape.last else len(bias)
         exact, power, products = [], torch.zeros((), dtype=torch.double), torch.zeros((), dtype=torch.double)
         for image, codes in zip(inputs.exact, inputs.codes, strict=True):
             result = F.conv2d(image, weights, bias, padding=1)
@@ -183,12 +184,6 @@ class Fit:
         layer = QuantisedConv(chosen.reshape(of_codes.shape), step, bias, inputs.layout, layout, offset)
         self.layers[name] = layer
         return Activations(exact, [layer(codes) for codes in inputs.codes], layout)
-
-    def _rectified(self, name: str, count: int) -> int:
-        """How many of a layer's ``count`` outputs pass a ReLU: the first ones. The others are signed."""
-        if name in HEADS:
-            return 0
-        return COLOURS if name == self.shape.last else count
 
     def _noise_gain(self, name: str) -> Tensor:
         """Return the power of noise in the colours per power of noise in each output of a convolution.
@@ -221,7 +216,9 @@ class Fit:
         else:
             below = any(name in level for level in self.shape.up[:-1])
             share, headroom = (1.0, self.headroom) if below else (COVERED, 1.0)
-            tops = headroom * torch.stack([_quantile(image[0].flatten(1), share) for image in exact]).amax(dim=0)
+            rows = [image[0].flatten(1) for image in exact]
+            quantiles = [x.kthvalue(max(round(share * x.shape[1]), 1), dim=1).values for x in rows]
+            tops = headroom * torch.stack(quantiles).amax(dim=0)
             tops = tops.clamp_min(1e-3 * tops.max())
             tops = tops**OWN_RANGE * tops.max() ** (1 - OWN_RANGE)
             slices = self._slices(name, tops)
@@ -263,11 +260,6 @@ def slices_per_channel(tops: Tensor, weights: Tensor, gain: Tensor, extra: int) 
         candidates = slices + torch.eye(len(slices))
         slices = candidates[noise(candidates).argmin()]
     return slices.long()
-
-
-def _quantile(values: Tensor, share: float) -> Tensor:
-    """Return the quantile of each row."""
-    return values.kthvalue(max(round(share * values.shape[1]), 1), dim=1).values
 
 
 def _patches(image: Tensor, pixels: Tensor) -> Tensor:
@@ -348,31 +340,23 @@ def run_unet_on_activations(
         return run_unet(shape, inputs, conv, pool, functools.partial(changed, lambda image: upsample(image, 2)), concat)
 
 
-def quantise_full_size_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor]) -> Fit:
-    """Quantise the denoiser of one render at full size.
-
-    Args:
-        shape, weights: as for :func:`quantise_mean_denoiser`.
-        codes: inputs of the network, see :func:`research.training.quantise.codes.full_size_codes`.
-    """
-    normals = CodeLayout(torch.full((3,), 1 / 255), torch.arange(6, 9))
-    layout = concatenated(sliced_layout(INPUT_SLICES, 0), sliced_layout(INPUT_SLICES, 3), normals)
-    # Its values are those of the calibration: unlike the mean of two renders of few spp, it has no rare light
-    fit = Fit(shape, weights, extra_slices=FULL_SIZE_SLICES, headroom=1.0)
-    run_unet_on_activations(shape, [activations(codes, layout)], fit.conv)
-    return fit
-
-
-def quantise_mean_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor]) -> Fit:
-    """Quantise a denoiser of both renders' mean.
+def quantise_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor], *, full_size: bool = False) -> Fit:
+    """Quantise a denoiser: of both renders' mean, or of one render at full size.
 
     Args:
         shape: of its U-Net.
         weights: in full precision.
-        codes: inputs of the network, see :func:`research.training.quantise.codes.denoiser_codes`.
+        codes: inputs of the network, see :func:`research.training.quantise.codes.denoiser_codes`, or
+            :func:`research.training.quantise.codes.full_size_codes`.
     """
-    scale = [1 / INPUT_SLICES / 255] * (3 * INPUT_SLICES) + [1 / 255] * 7
-    layout = CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
-    fit = Fit(shape, weights)
+    if full_size:
+        normals = CodeLayout(torch.full((3,), 1 / 255), torch.arange(6, 9))
+        layout = concatenated(sliced_layout(INPUT_SLICES, 0), sliced_layout(INPUT_SLICES, 3), normals)
+        # Its values are those of the calibration: unlike the mean of two renders of few spp, it has no rare light
+        fit = Fit(shape, weights, extra_slices=FULL_SIZE_SLICES, headroom=1.0)
+    else:
+        scale = [1 / INPUT_SLICES / 255] * (3 * INPUT_SLICES) + [1 / 255] * 7
+        layout = CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
+        fit = Fit(shape, weights)
     run_unet_on_activations(shape, [activations(codes, layout)], fit.conv)
     return fit

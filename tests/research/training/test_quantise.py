@@ -148,7 +148,7 @@ def test_the_graph_computes_what_was_fitted(tmp_path):
 
     run_unet(shape, [10], conv, same, same, lambda one, other: one + other)
     drawn = [codes_of(noisy(picture(64, 48), 4, seed)) for seed in range(2)]
-    fit = gptq.quantise_mean_denoiser(shape, weights, drawn)
+    fit = gptq.quantise_denoiser(shape, weights, drawn)
     onnx.save(Graph(fit).model(), tmp_path / "base.onnx")
     session = load_network(tmp_path / "base.onnx", 1)
     codes = drawn[0]

@@ -74,14 +74,12 @@ def split_of(seed: int) -> str:
     return {0: "validation", 1: "test"}.get(seed % 20, "train")
 
 
-def path_of(out: Path, renderer: str, seed: int, view: int, suffix: str = ".npz") -> Path:
-    """Return the file of a scene's view; ``suffix`` is ``SAMPLES_SUFFIX`` if it keeps single samples."""
-    return out / f"{renderer}-{seed:06d}-{view}{suffix}"
-
-
 def missing(out: Path, renderer: str, seed: int, count: int, suffix: str = ".npz") -> dict[int, Path]:
-    """Return those of a scene's first ``count`` views that have no file yet: by view, the file."""
-    files = {view: path_of(out, renderer, seed, view, suffix) for view in range(count)}
+    """Return those of a scene's first ``count`` views that have no file yet: by view, the file.
+
+    ``suffix`` is ``SAMPLES_SUFFIX`` if they keep single samples.
+    """
+    files = {view: out / f"{renderer}-{seed:06d}-{view}{suffix}" for view in range(count)}
     return {view: file for view, file in files.items() if not file.exists()}
 
 

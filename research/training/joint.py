@@ -245,11 +245,6 @@ def blend(
             log_encode(means[level]) if level else samples,
         ]
         fused = mixed(logits[level], candidates)
-    return within_renders(fused, lrhs, samples, margin)
-
-
-def within_renders(fused: Tensor, lrhs: Tensor, samples: Tensor, margin: float) -> Tensor:
-    """Clamp a result to what the renders allow, see :func:`highest_allowed`; the arguments are those of `blend`."""
     low, mean = lrhs.split(LRHS_CHANNELS, dim=1)
     lowest, highest = (
         upsample(sign * highest_allowed(sign * low, sign * mean + margin, sign * samples), 2) for sign in (-1.0, 1.0)

@@ -48,7 +48,14 @@ Weights = Mapping[str, Tensor]
 
 
 @functools.cache
-def _installed_weights(network: str) -> dict[str, NDArray[np.float16]]:
+def pretrained_weights(network: str) -> dict[str, Tensor]:
+    """Read the weights of a key of `NETWORKS` from the installed pyoidn, by Open Image Denoise's names.
+
+    Every call returns the same tensors, which nobody changes.
+
+    Raises:
+        InputError: pyoidn is not installed, or has other weights.
+    """
     begins, install = "the joint network begins from the weights of Open Image Denoise", "pip install pyoidn==2.5.1"
     try:
         import pyoidn
@@ -58,16 +65,7 @@ def _installed_weights(network: str) -> dict[str, NDArray[np.float16]]:
     weights = read_weights(network, library) if library else None
     if weights is None:
         raise InputError(f"{begins} 2.5, and the installed pyoidn has others: {install}")
-    return weights
-
-
-def pretrained_weights(network: str) -> dict[str, Tensor]:
-    """Read the weights of a key of `NETWORKS` from the installed pyoidn, by Open Image Denoise's names.
-
-    Raises:
-        InputError: pyoidn is not installed, or has other weights.
-    """
-    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in _installed_weights(network).items()}
+    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in weights.items()}
 
 
 def read_weights(network: str, library: Path) -> dict[str, NDArray[np.float16]] | None:

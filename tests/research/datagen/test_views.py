@@ -15,7 +15,7 @@ def _write(folder, seed=20, brightness=1.0):
     lr = rng.random((len(views.LR_SPP), n, n, 3), np.float32) * brightness
     ref = rng.random((n, n, 3), np.float32) * brightness
     meta = {"seed": f"cycles-{seed}", "split": views.split_of(seed)}
-    views.save(views.path_of(folder, "cycles", seed, 0), views.pack(hr, {1: lr}, ref, rng, meta))
+    views.save(folder / f"cycles-{seed:06d}-0.npz", views.pack(hr, {1: lr}, ref, rng, meta))
     return hr, lr, ref
 
 

@@ -41,5 +41,5 @@ def write_wall(
         {"seed": 3, "split": split, "renderer": "none", "generator": 0},
         ref_layers,
     )
-    views.save(views.path_of(folder, "mitsuba", 3, 0, views.SAMPLES_SUFFIX), arrays)
+    views.save(folder / f"mitsuba-000003-0{views.SAMPLES_SUFFIX}", arrays)
     return folder

@@ -131,7 +131,7 @@ def build_room(animation: Animation, frame: int, at: float) -> Room:
     reflecting: list[str] = []
 
     def marked(names: list[str], mesh: Mesh, bsdf: Any) -> None:
-        names.append(f"mesh{len(scene._parts)}")
+        names.append(f"mesh{len(scene.parts)}")
         scene.add(mesh, bsdf)
 
     block = meshes.block(0.45, 0.45, 0.6)

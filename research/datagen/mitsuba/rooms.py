@@ -49,7 +49,7 @@ def build(folder: Path, seed: int, assets: Assets) -> tuple[mi.Scene, Scene]:
     plan.room = np.array([width, depth, height])
     light = ("own", "dimmed", "moved", "closed", "hdri")[rng.choice(5, p=(0.2, 0.15, 0.2, 0.3, 0.15))]
     for index, shape in enumerate(_shapes(folder / room.name / "scene.xml", room, light, rng)):
-        plan.add_shape(f"room{index}", shape)
+        plan.parts[f"room{index}"] = shape
 
     if light == "hdri":
         plan.environment(float(10 ** rng.uniform(-0.3, 0.7)))

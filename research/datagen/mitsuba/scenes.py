@@ -38,7 +38,7 @@ class Scene:
         self.focus: list[np.ndarray] = []  # points worth looking at
         self.surfaces: list[tuple[np.ndarray, float, float]] = []  # tops to put things on: centre, half sizes
         self.room: np.ndarray | None = None  # (3,) inner size, the floor centred on the origin
-        self._parts: dict[str, object] = {}
+        self.parts: dict[str, object] = {}  # what Mitsuba gets
 
     @property
     def size(self) -> np.ndarray:
@@ -56,7 +56,7 @@ class Scene:
             rgb = [float(c) for c in radiance]
             light = {"type": "area", "radiance": {"type": "rgb", "value": rgb}, "sampling_weight": weight}
             props["emitter"] = mi.load_dict(light)
-        name = f"mesh{len(self._parts)}"
+        name = f"mesh{len(self.parts)}"
         n = mesh.n
         shape = mi.Mesh(
             name, vertex_count=len(mesh.v), face_count=len(mesh.f),
@@ -69,11 +69,7 @@ class Scene:
         if n is not None:
             params["vertex_normals"] = np.ascontiguousarray(n, np.float32).ravel()
         params.update()
-        self._parts[name] = shape
-
-    def add_shape(self, name: str, shape: mi.Shape) -> None:
-        """Add a shape that was loaded elsewhere."""
-        self._parts[name] = shape
+        self.parts[name] = shape
 
     def light(self, mesh: Mesh, radiance: np.ndarray, weight: float = 1.0) -> None:
         self.add(mesh, mat.diffuse(np.full((2, 2, 3), 0.2)), radiance, weight)
@@ -87,29 +83,14 @@ class Scene:
         else:
             image = tex.sky(rng)
         to_world = mi.ScalarTransform4f().rotate([0, 0, 1], float(rng.uniform(0, 360))).rotate([1, 0, 0], 90)
-        self._parts["environment"] = mi.load_dict({
+        self.parts["environment"] = mi.load_dict({
             "type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(image, np.float32)), "scale": scale,
             "to_world": to_world,
         })  # fmt: skip
 
-    def spot(self, origin: np.ndarray, target: np.ndarray, intensity: np.ndarray, angle: float) -> None:
-        self._parts[f"spot{len(self._parts)}"] = mi.load_dict({
-            "type": "spot", "intensity": {"type": "rgb", "value": [float(c) for c in intensity]},
-            "cutoff_angle": float(angle), "beam_width": float(angle * 0.7),
-            "to_world": mi.ScalarTransform4f().look_at(
-                [float(x) for x in origin], [float(x) for x in target], [0.1, 0.2, 1]
-            ),
-        })  # fmt: skip
-
-    def point(self, origin: np.ndarray, intensity: np.ndarray) -> None:
-        self._parts[f"point{len(self._parts)}"] = mi.load_dict({
-            "type": "point", "position": [float(x) for x in origin],
-            "intensity": {"type": "rgb", "value": [float(c) for c in intensity]},
-        })  # fmt: skip
-
     def finish(self) -> mi.Scene:
         """Return the scene as Mitsuba has it."""
-        return mi.load_dict({"type": "scene", **self._parts})
+        return mi.load_dict({"type": "scene", **self.parts})
 
     # -- things ------------------------------------------------------------------------------------
 
@@ -419,7 +400,9 @@ class Scene:
     def lamp_tiny(self) -> None:
         """Add a small bright ball, or a point that no ray can hit."""
         if self.rng.random() < 0.2:
-            self.point(self.inside(0.3, 0.95), self.tinted_light(1.0))
+            origin, intensity = self.inside(0.3, 0.95).tolist(), self.tinted_light(1.0).tolist()
+            point = {"type": "point", "position": origin, "intensity": {"type": "rgb", "value": intensity}}
+            self.parts[f"point{len(self.parts)}"] = mi.load_dict(point)
             return
         r = 10 ** self.rng.uniform(-2.1, -1.2)
         self.light(geo.sphere(r, 16).moved(*self.inside(0.3, 0.95)), self.tinted_light(0.3 / r**2))
@@ -467,8 +450,13 @@ class Scene:
         self.light(geo.sphere(r, 16).moved(*(at + offset)), self.tinted_light(0.5 / r**2))
 
     def lamp_spot(self) -> None:
-        power = self.tinted_light(10 ** self.rng.uniform(0, 1.2))
-        self.spot(self.inside(0.7, 0.95), self.inside(0, 0.4), power, self.rng.uniform(8, 35))
+        power = self.tinted_light(10 ** self.rng.uniform(0, 1.2)).tolist()
+        origin, target, angle = self.inside(0.7, 0.95).tolist(), self.inside(0, 0.4).tolist(), self.rng.uniform(8, 35)
+        self.parts[f"spot{len(self.parts)}"] = mi.load_dict({
+            "type": "spot", "intensity": {"type": "rgb", "value": power},
+            "cutoff_angle": float(angle), "beam_width": float(angle * 0.7),
+            "to_world": mi.ScalarTransform4f().look_at(origin, target, [0.1, 0.2, 1]),
+        })  # fmt: skip
 
     def lamp_panel(self) -> None:
         rng = self.rng

@@ -8,7 +8,7 @@ Mitsuba 3 renders the scenes of `research.benchmarks.render.own_scenes`. For n s
 HRLS of n/2 spp and an LRHS of half its size with as many samples, and OIDN gets an ordinary render with n spp, or the
 HRLS alone. With 1 spp there is one render, and both get it. OIDN runs as its documentation recommends: high quality,
 albedo and normal prefiltered. Seconds are those of the whole command. A shot in which the camera moves is scored by its
-flicker and its motion error, too: see `research.benchmarks.shots.measures`.
+flicker, too: see `research.benchmarks.shots.measures`.
 
 OUT gets the renders, the results, ``table.csv``, and a page of pictures for each scene, in a folder ``quick`` or
 ``full``. A run that was stopped continues. ``--oidn`` names a Python with another pyoidn, NumPy and OpenEXR; its rows
@@ -42,7 +42,7 @@ from research.benchmarks.accuracy import mean_flip
 from research.benchmarks.render.film import write_exr
 from research.benchmarks.render.own_scenes import GROUPS, SCENES, lamps
 from research.benchmarks.render.sequences import Camera
-from research.benchmarks.shots.measures import flicker, motion_error
+from research.benchmarks.shots.measures import flicker
 from research.datagen.mitsuba import start as start_mitsuba
 
 LAYERS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "N.X", "N.Y", "N.Z")
@@ -52,8 +52,8 @@ QUALITIES = ("fast", "balanced", "best")
 OIDN = {"on the HRLS": "hr", "at full resolution": "full"}
 #: Columns that tell rows apart.
 KEYS = ("scene", "filter", "spp", "method")
-#: Columns with a measurement, and how the page shows them.
-SCORES = {"psnr": ".2f", "relmse": ".4f", "flip": ".4f", "flicker": ".4f", "motion_error": ".4f", "seconds": ".1f"}
+#: Columns that are printed.
+COLUMNS = (*KEYS, "psnr", "relmse", "flip", "flicker", "seconds")
 SCALE = 2
 SHOT = "shot"
 #: Degrees that the camera of the shot turns from frame to frame, and its horizontal field of view.
@@ -181,7 +181,6 @@ def measure(folder: Path, done: set[Any], key: tuple[str, str, int], python: str
     """
     scene, _, spp = key
     renders, is_shot = folder / f"{spp}spp", scene == SHOT
-    fuse = shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or "msspl-fuse"
     parts = ("full",) if spp == 1 else ("lr", "hr")
     inputs = [str(renders / f"{part}{'.####' if is_shot else ''}.exr") for part in parts]
     version = oidn_version(python)
@@ -194,7 +193,7 @@ def measure(folder: Path, done: set[Any], key: tuple[str, str, int], python: str
         start = time.perf_counter()
         if method in QUALITIES:
             out = str(target / ("out.####.exr" if is_shot else "out.exr"))
-            _run([fuse, *inputs, "-o", out, "--quality", method, "--overwrite", "--no-preview"])
+            _run([_program("msspl-fuse"), *inputs, "-o", out, "--quality", method, "--overwrite", "--no-preview"])
         else:
             part = oidn_methods[method]
             for source in sorted(renders.glob(f"{part}.*exr")):
@@ -207,6 +206,11 @@ def measure(folder: Path, done: set[Any], key: tuple[str, str, int], python: str
 def oidn_version(python: str) -> str:
     """Return the version of the pyoidn that a Python has."""
     return _run([python, "-c", "import importlib.metadata as m; print(m.version('pyoidn'))"]).strip()
+
+
+def _program(name: str) -> str:
+    """Return the program of this Python's environment, or else the one on the path."""
+    return shutil.which(name, path=sysconfig.get_path("scripts")) or name
 
 
 def _run(command: Sequence[str]) -> str:
@@ -224,7 +228,7 @@ def _scores(folder: Path, target: Path) -> dict[str, float]:
     means = {name: float(np.mean([row[name] for row in rows])) for name in ("psnr", "relmse", "flip")}
     if len(images) > 1:
         shown, truth = srgb(np.stack(images)), srgb(np.stack(references))
-        means |= {"flicker": flicker(shown, (truth, truth)), "motion_error": motion_error(shown, truth)}
+        means["flicker"] = flicker(shown, (truth, truth))
     return means
 
 
@@ -233,25 +237,16 @@ def _pixels(path: Path) -> Image:
 
 
 def write_pages(out: Path, rows: Sequence[results.Row]) -> None:
-    """Write a page of pictures for each scene, filter and number of samples, by ``msspl compare``."""
-    for scene, kind, spp in dict.fromkeys(tuple(row[key] for key in KEYS[:3]) for row in rows):
-        _compare(out / scene / kind, int(spp), ".0001" if scene == SHOT else "")
-
-
-def _cell(row: results.Row, name: str) -> str:
-    return f"{row[name]:{SCORES.get(name, '')}}" if name in row else ""
-
-
-def _compare(folder: Path, spp: int, frame: str) -> None:
-    """Write the page of pictures of a scene and filter, unless it is newer than all results."""
-    page, renders = folder / f"{spp}spp.html", folder / f"{spp}spp"
-    # The page opens with the first two.
+    """Write a page of pictures for each scene, filter and number of samples, unless it is newer than all results."""
+    # A page opens with the first two.
     parts = ("best/out", "OIDN*/out", "balanced/out", "fast/out", "full", "hr")
-    images = [path for part in parts for path in sorted(renders.glob(f"{part}{frame}.exr"))]
-    if page.exists() and page.stat().st_mtime > max(path.stat().st_mtime for path in images):
-        return
-    msspl = shutil.which("msspl", path=sysconfig.get_path("scripts")) or "msspl"
-    _run([msspl, "compare", *map(str, images), "--reference", str(folder / f"ref{frame}.exr"), "--html", str(page)])
+    for scene, kind, spp in dict.fromkeys(tuple(row[key] for key in KEYS[:3]) for row in rows):
+        folder, frame = out / scene / kind, ".0001" if scene == SHOT else ""
+        page, renders = folder / f"{spp}spp.html", folder / f"{spp}spp"
+        images = [path for part in parts for path in sorted(renders.glob(f"{part}{frame}.exr"))]
+        if not page.exists() or page.stat().st_mtime <= max(path.stat().st_mtime for path in images):
+            reference = str(folder / f"ref{frame}.exr")
+            _run([_program("msspl"), "compare", *map(str, images), "--reference", reference, "--html", str(page)])
 
 
 def main() -> None:
@@ -280,7 +275,7 @@ def main() -> None:
     order = {job: position for position, job in enumerate(jobs)}
     rows.sort(key=lambda row: (order[row["scene"], row["filter"]], row["spp"]))
     write_pages(out, rows)
-    print(results.markdown((*KEYS, *SCORES), [[_cell(row, name) for name in (*KEYS, *SCORES)] for row in rows]))
+    print(results.plain([{name: row[name] for name in COLUMNS if name in row} for row in rows]))
 
 
 if __name__ == "__main__":

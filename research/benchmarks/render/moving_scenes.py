@@ -75,8 +75,6 @@ class Room:
     scene: Any
     moved: list[Any] = field(default_factory=list)
     """The shapes that move."""
-    reflecting: list[Any] = field(default_factory=list)
-    """Mirrors and glass."""
 
 
 def camera_matrix(animation: Animation, at: float) -> np.ndarray:
@@ -128,29 +126,27 @@ def build_room(animation: Animation, frame: int, at: float) -> Room:
         second = meshes.rectangle(0.4, 0.4).rotated(meshes.rotation((1, 0, 0), np.pi)).moved(-1.6, 1.2, height - 0.02)
         scene.light(second, np.array([130.0, 85.0, 45.0]) if frame >= LAMP_ON else np.full(3, 1e-6))
     moved: list[str] = []
-    reflecting: list[str] = []
 
-    def marked(names: list[str], mesh: Mesh, bsdf: Any) -> None:
-        names.append(f"mesh{len(scene.parts)}")
+    def marked(mesh: Mesh, bsdf: Any) -> None:
+        moved.append(f"mesh{len(scene.parts)}")
         scene.add(mesh, bsdf)
 
     block = meshes.block(0.45, 0.45, 0.6)
     place = object_matrix(animation, at)
     stands = object_matrix(Animation(), 0) if animation.flakes else place
-    marked(moved, block.rotated(stands[:3, :3]).moved(*stands[:3, 3]), materials.diffuse(textures.glyphs(rng)))
-    if not (animation.slide or animation.turn):
-        moved = []
+    add_block = marked if animation.slide or animation.turn else scene.add
+    add_block(block.rotated(stands[:3, :3]).moved(*stands[:3, 3]), materials.diffuse(textures.glyphs(rng)))
     if animation.flakes:
         centres = rng.uniform((-2.0, -0.6, 0.3), (2.2, 2.2, 2.8), (700, 3)) + place[:3, 3] - BLOCK
         radii = rng.uniform(0.006, 0.02, len(centres))
         flakes = [meshes.sphere(r, 8).moved(*centre) for r, centre in zip(radii, centres, strict=True)]
-        marked(moved, meshes.merge(flakes), materials.diffuse(np.full((2, 2, 3), 0.85, np.float32)))
+        marked(meshes.merge(flakes), materials.diffuse(np.full((2, 2, 3), 0.85, np.float32)))
     if animation.shadow:
         flat(meshes.block(0.5, 0.5, 0.05).moved(0.5 + at * animation.shadow, 0.5, 2.5), np.full((2, 2, 3), 0.5))
     if animation.mirror:
         glass = meshes.rectangle(1.6, 1.4).rotated(wall).moved(0.3, y - 0.02, 1.3)
-        marked(reflecting, glass, materials.mirror(np.full((2, 2, 3), 0.9, np.float32)))
-        marked(reflecting, meshes.sphere(0.3).moved(0.85, 0.7, 0.3), materials.glass())
+        scene.add(glass, materials.mirror(np.full((2, 2, 3), 0.9, np.float32)))
+        scene.add(meshes.sphere(0.3).moved(0.85, 0.7, 0.3), materials.glass())
     if animation.foliage:
         roots = np.stack([rng.uniform(-2, 2, 2500), rng.uniform(0.2, 2.2, 2500), np.zeros(2500)], axis=1)
         scene.add(meshes.blades(rng, roots, 0.35, 0.015, 0.5), materials.diffuse(textures.foliage(rng)))
@@ -158,4 +154,4 @@ def build_room(animation: Animation, frame: int, at: float) -> Room:
         scene.add(meshes.leaves(rng, centres, 0.12), materials.diffuse(textures.foliage(rng)))
     loaded = scene.finish()
     shapes = {shape.id(): shape for shape in loaded.shapes()}
-    return Room(loaded, [shapes[name] for name in moved], [shapes[name] for name in reflecting])
+    return Room(loaded, [shapes[name] for name in moved])

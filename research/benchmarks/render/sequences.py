@@ -12,8 +12,6 @@ camera pans and trucks, so that near surfaces move faster. A room of our own get
     full.####.exr                    2 spp, with albedo and normal
     lr_x2.####.exr, lr_x4.####.exr   4 spp at half, 16 spp at a quarter of the resolution
     ref_a.####.exr, ref_b.####.exr   two halves of the reference, with independent noise
-    mask.####.exr                    what lies under the centre of each pixel: position, depth, whether it moves or
-                                     reflects, motion
 
 ``motionBack`` and ``motionFore`` say where the surface of a pixel was in the frame before, and will be in the next
 one, in HRLS pixels from here, x to the right and y downwards. They are exact: the positions that rays hit, moved with
@@ -58,7 +56,6 @@ CHANNELS = (
     *("dd.Z", "position.X", "position.Y", "position.Z"),
 )
 MOTION = ("motionBack.X", "motionBack.Y", "motionFore.X", "motionFore.Y")
-MASK = ("position.X", "position.Y", "position.Z", "depth.Z", "moves.Y", "reflects.Y")
 #: Scene -> centre of the crop, as shares of the frame.
 SCENES = {"staircase2": (0.53, 0.60), "lamp": (0.47, 0.40)}
 
@@ -106,10 +103,8 @@ class _FileScene:
         ]
         self._focal = self.size[0] / 2 / np.tan(np.radians(float(sensor["x_fov"][0])) / 2)
         self._start = np.array(sensor["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        self._depth = 0.0  # of what the camera moves by `TRUCK` pixels; not known yet
         self._depth = float(np.median(surfaces(mi, self._room, self.camera(0.0))[..., 3]))
-
-    #: Depth of what the camera moves by `TRUCK` pixels; 0 until it is known.
-    _depth = 0.0
 
     def camera(self, at: float) -> Camera:
         angle = at * self._step * PAN / self._focal
@@ -150,27 +145,25 @@ class _AnimatedRoom:
 
 
 def surfaces(mi: Any, room: Room, camera: Camera) -> NDArray[Any]:
-    """Return what the centre of each pixel shows, (h, w, 6): `MASK`. A ray that hits nothing has the depth 0."""
+    """Return what the centre of each pixel shows, (h, w, 5): its position, its depth, and whether it moves.
+
+    A ray that hits nothing has the depth 0.
+    """
     origins, directions = camera.rays()
     ray = mi.Ray3f(mi.Point3f(*origins.T), mi.Vector3f(*directions.T))
     hit = room.scene.ray_intersect(ray)
     valid = np.array(hit.is_valid())
     depth = np.where(valid, np.array(hit.t), 0)
-
-    def any_of(shapes: list[Any]) -> NDArray[Any]:
-        hits = np.zeros(len(depth), bool)
-        for shape in shapes:
-            hits |= np.array(hit.shape == mi.ShapePtr(shape))
-        return hits
-
+    moves = np.zeros(len(depth), bool)
+    for shape in room.moved:
+        moves |= np.array(hit.shape == mi.ShapePtr(shape))
     far = np.where(valid, depth, 1e5)[:, None]
-    columns = [origins + far * directions, depth[:, None]]
-    columns += [any_of(shapes)[:, None] for shapes in (room.moved, room.reflecting)]
-    return np.concatenate(columns, axis=1).reshape(HEIGHT, WIDTH, 6)
+    columns = [origins + far * directions, depth[:, None], moves[:, None]]
+    return np.concatenate(columns, axis=1).reshape(HEIGHT, WIDTH, 5)
 
 
 def motion(shown: NDArray[Any], scene: Any, at: float, other: float) -> NDArray[Any]:
-    """Return where the surfaces (h, w, 6) of one time are at another, in pixels from their place, (h, w, 2)."""
+    """Return where the surfaces (h, w, 5) of one time are at another, in pixels from their place, (h, w, 2)."""
     positions = shown[..., :3]
     matrix = scene.object_moves(at, other)
     moved = positions @ matrix[:3, :3].T + matrix[:3, 3]
@@ -189,14 +182,13 @@ def render_sequence(mi: Any, scene: Any, folder: Path, pixel_filter: str) -> Non
     for frame in range(FRAMES):
         at = frame - middle
         wanted = kinds if folder.name == STATIC and frame > 0 else [*kinds, *references]
-        paths = {kind: folder / f"{kind}.{frame + 1:04d}.exr" for kind in ("mask", *(kind for kind, _, _ in wanted))}
+        paths = {kind: folder / f"{kind}.{frame + 1:04d}.exr" for kind, _, _ in wanted}
         if all(path.exists() for path in paths.values()):
             continue
         folder.mkdir(parents=True, exist_ok=True)
         room, camera = scene.room(frame, at), scene.camera(at)
         shown = surfaces(mi, room, camera)
         vectors = np.concatenate([motion(shown, scene, at, at + step) for step in (-1, 1)], axis=-1)
-        write_exr(paths["mask"], np.concatenate([shown, vectors], axis=-1), (*MASK, *MOTION), np.float32)
         for kind, scale, spp in wanted:
             if paths[kind].exists():
                 continue

@@ -23,27 +23,26 @@ from pathlib import Path
 
 import numpy as np
 
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions
 from research.benchmarks import results
 from research.benchmarks.results import Row
-from research.benchmarks.shots.measures import flicker, psnr, relmse
-from research.benchmarks.shots.methods import Made, all_methods
+from research.benchmarks.shots.measures import flicker, psnr
+from research.benchmarks.shots.methods import all_methods
 from research.benchmarks.shots.sequence import Sequence, load, without_vectors
 
 KEYS = ("sequence", "scale", "method")
 
 
-def measure(sequence: Sequence, made: list[Made]) -> Iterator[Row]:
-    """Yield a row for each method."""
+def measure(sequence: Sequence, made: list[tuple[Row, Array]]) -> Iterator[Row]:
+    """Yield a row for each method of :func:`research.benchmarks.shots.methods.all_methods`."""
     truth = srgb(sequence.truth[0]), srgb(sequence.truth[1])
-    for method in made:
-        images = srgb(method.images)
+    for columns, linear in made:
+        images = srgb(linear)
         by_frame = [psnr(image, (first, second)) for image, first, second in zip(images, *truth, strict=True)]
-        row: Row = {"sequence": sequence.name, "scale": method.scale, "method": method.method}
-        row |= {"model": method.model} if method.model else {}
-        row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
-        row |= {"relmse": relmse(method.images, sequence.truth), "flicker": flicker(images, truth)}
+        row: Row = {"sequence": sequence.name, **columns}
+        row |= {"psnr": float(np.mean(by_frame)), "flicker": flicker(images, truth)}
         yield row | {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
 
 

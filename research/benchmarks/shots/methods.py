@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -27,35 +26,26 @@ from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles, find_shot
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.model.contract import ONE_SIZE
-from research.benchmarks.peers import oidn, oidn_prefiltered, oidn_split
+from research.benchmarks.peers import oidn_prefiltered, oidn_split
+from research.benchmarks.results import Row
 from research.benchmarks.shots.sequence import Sequence as MovingSequence
 from research.benchmarks.shots.sequence import write_one_render
 
 ALONE, NEIGHBOURS = "frame by frame", "with neighbours"
-OIDN, OIDN_BEST, OIDN_SPLIT = "OIDN", "OIDN prefiltered", "OIDN on every second pixel"
-OIDN_NEIGHBOURS, OIDN_SPLIT_NEIGHBOURS = f"{OIDN_BEST}, {NEIGHBOURS}", f"{OIDN_SPLIT}, {NEIGHBOURS}"
+OIDN_BEST, OIDN_SPLIT = "OIDN prefiltered", "OIDN on every second pixel"
 SCALES = (2, 4)
 #: The qualities that are measured: what the names of their methods begin with.
 QUALITIES = {"balanced": "", "best": "best, "}
-
-
-@dataclass(frozen=True)
-class Made:
-    """A method's frames."""
-
-    method: str
-    scale: int
-    """Of the LRHS; 1 for what reads the full-resolution render with all samples."""
-    images: Array
-    """Linear (frames, h, w, 3)."""
-    model: str = ""
-    """Of ours."""
+Denoiser = Callable[[ReadableRender], Array]
 
 
 def all_methods(
     sequence: MovingSequence, options: TemporalOptions = TemporalOptions(), pattern: str = "*", *, spread: bool = False
-) -> Iterator[Made]:
-    """Yield each method on a sequence whose name matches the pattern.
+) -> Iterator[tuple[Row, Array]]:
+    """Yield each method on a sequence whose name matches the pattern: columns, and linear images (frames, h, w, 3).
+
+    The columns are ``method``, ``scale`` and, of ours, ``model``. The scale is that of the LRHS, and 1 for what reads
+    the full-resolution render with all samples.
 
     Ours fuse pairs, and at a scale of 1 the full-resolution render that OIDN gets.
 
@@ -64,22 +54,22 @@ def all_methods(
     neighbours are averaged. If a pixel filter has ``spread`` the noise, OIDN also reads every second pixel.
     """
     full = [map_render(open_exr(sequence.folder / f"full.{n:04d}.exr")) for n in sequence.numbers]
-    peers = {OIDN: oidn, OIDN_BEST: oidn_prefiltered} | ({OIDN_SPLIT: oidn_split} if spread else {})
+    peers = {OIDN_BEST: oidn_prefiltered} | ({OIDN_SPLIT: oidn_split} if spread else {})
     for name, denoised in peers.items():
         if fnmatchcase(name, pattern):
-            yield Made(name, 1, np.stack([denoised(render) for render in full]))
+            yield {"method": name, "scale": 1}, np.stack([denoised(render) for render in full])
     with tempfile.TemporaryDirectory() as folder:
         for scale in (ONE_SIZE, *SCALES):
-            for name, run in _by_scale(sequence, scale, options, Path(folder), spread=spread):
+            for name, run in _by_scale(sequence, scale, options, Path(folder), peers):
                 if fnmatchcase(name, pattern):
-                    model = "" if isinstance(run, _RunOfPeer) else f"{run.settings.model}-x{scale}"
-                    yield Made(name, scale, _images(run), model)
+                    model = {} if isinstance(run, _RunOfPeer) else {"model": f"{run.settings.model}-x{scale}"}
+                    yield {"method": name, "scale": scale} | model, _images(run)
 
 
 class _RunOfPeer(ShotRun):
     """A shot whose full-resolution renders are averaged as ours are, and then denoised by another program."""
 
-    def __init__(self, denoised: Callable[[ReadableRender], Array], folder: Path, *shot: Any) -> None:
+    def __init__(self, denoised: Denoiser, folder: Path, *shot: Any) -> None:
         super().__init__(*shot)
         self._denoised, self._folder = denoised, folder
 
@@ -99,7 +89,7 @@ class _RunOfPeer(ShotRun):
 
 
 def _by_scale(
-    sequence: MovingSequence, scale: int, options: TemporalOptions, folder: Path, *, spread: bool
+    sequence: MovingSequence, scale: int, options: TemporalOptions, folder: Path, peers: Mapping[str, Denoiser]
 ) -> Iterator[tuple[str, ShotRun]]:
     """Yield the methods for a scale: the name, and how a shot is fused. ``folder`` is for files that they read."""
     one = scale == ONE_SIZE
@@ -116,9 +106,8 @@ def _by_scale(
         yield prefix + ALONE, ShotRun(settings, ShotPlan(), shot.frames)
         yield prefix + NEIGHBOURS, ShotRun(settings, plan, shot.frames)
     # The peers' frames have the neighbours of the last quality, `best`, and the LRHS of a pair tests their light.
-    peers = {OIDN_NEIGHBOURS: oidn_prefiltered} | ({OIDN_SPLIT_NEIGHBOURS: oidn_split} if spread else {})
     for name, denoised in () if one else peers.items():
-        yield name, _RunOfPeer(denoised, sequence.folder, settings, plan, shot.frames)
+        yield f"{name}, {NEIGHBOURS}", _RunOfPeer(denoised, sequence.folder, settings, plan, shot.frames)
 
 
 def _images(run: ShotRun) -> Array:

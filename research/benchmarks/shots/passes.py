@@ -31,13 +31,12 @@ SIZE, LAMPS, FRAMES = (320, 180), 4, 18
 ENDS = 6
 
 
-def images_of(path: Path) -> list[Array]:
-    """Return beauty and light groups of a frame, (h, w, 3) each."""
+def groups_of(path: Path) -> list[Array]:
+    """Return the light groups of a frame, (h, w, 3) each."""
     render = map_render(open_exr(path))
-    (lamps,) = render.additive_sets
-    names = ["rgb", *layer_names([lamps]).values()]
-    pixels = light_of(render, layer_names([lamps])).pixels.read(render.data_window, names)
-    return [pixels[name] for name in names]
+    names = layer_names(render.additive_sets)
+    pixels = light_of(render, names).pixels.read(render.data_window, names.values())
+    return [pixels[name] for name in names.values()]
 
 
 def scores(errors: Array) -> tuple[float, float]:
@@ -46,8 +45,8 @@ def scores(errors: Array) -> tuple[float, float]:
     return float(-10 * np.log10(np.mean(errors**2))), float(np.abs(moved).mean())
 
 
-def measure(folder: Path, scale: int, quality: str, frames: str) -> list[Row]:
-    """Return a row for the beauty, and one for the mean of all passes."""
+def measure(folder: Path, scale: int, quality: str, frames: str) -> Row:
+    """Return the means of all passes."""
     out = folder / f"{quality} {frames}"
     out.mkdir()
     report = fuse_shot(folder / "lr", folder / "hr", out, model=quality, temporal=TemporalOptions(frames))
@@ -56,12 +55,11 @@ def measure(folder: Path, scale: int, quality: str, frames: str) -> list[Row]:
     errors = []
     for number in range(1 + ENDS, FRAMES + 1 - ENDS):
         _, lights = clean_frame(number, FRAMES, *SIZE, LAMPS)
-        fused = images_of(out / f"hr.{number:04d}.exr")
-        errors.append([image - clean for image, clean in zip(fused, [sum(lights), *lights], strict=True)])
-    beauty, *passes = (scores(images) for images in np.swapaxes(np.array(errors), 0, 1))
-    scored = {"beauty": beauty, "passes": np.mean(passes, axis=0)}
+        fused = groups_of(out / f"hr.{number:04d}.exr")
+        errors.append([image - clean for image, clean in zip(fused, lights, strict=True)])
+    psnr, flicker = np.mean([scores(images) for images in np.swapaxes(np.array(errors), 0, 1)], axis=0).tolist()
     key: Row = {"scale": scale, "quality": quality, "temporal": frames, "model": find_model(scale, quality).stem}
-    return [key | {"of": name, "psnr": float(psnr), "flicker": float(f)} for name, (psnr, f) in scored.items()]
+    return key | {"of": "passes", "psnr": psnr, "flicker": flicker}
 
 
 def main() -> None:
@@ -72,7 +70,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             write_shot(Path(folder), FRAMES, *SIZE, scale, LAMPS)
             for quality, frames in itertools.product(("balanced", "best"), ("off", "auto")):
-                rows += measure(Path(folder), scale, quality, frames)
+                rows.append(measure(Path(folder), scale, quality, frames))
     results.show(rows, args.table)
 
 

@@ -9,28 +9,26 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenEXR
-import OpenImageIO as oiio
 
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.motion.source import MotionFrame, find_motion
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
+from oiio_msspl.image.filters import blurred
+from oiio_msspl.image.sampling import sample_cubic
 from research.benchmarks.render.sequences import MOTION, STATIC
 from research.benchmarks.scenes import beauty
-from research.benchmarks.shots.measures import Mask, blur, warped
+from research.benchmarks.shots.measures import Mask
 
 #: A surface is hidden in a neighbour if the way there and back ends further away than this, in pixels.
 ROUND_TRIP = 1.0
-#: The light has changed where the reference differs from its neighbour by this, in sRGB values, after a blur of the
-#: squares by this many pixels.
-CHANGED, CHANGED_BLUR = 0.02, 1.5
-#: Names of the masks.
-MASKS = ("disocclusion", "moved", "light", "reflection")
+#: The light has changed where the reference differs from its neighbour by this, in sRGB values, after the squares were
+#: blurred so often.
+CHANGED, BLURS = 0.02, 4
 
 
 @dataclass(frozen=True)
@@ -43,8 +41,8 @@ class Sequence:
     truth: tuple[Array, Array]
     """Two references with independent noise, linear (frames, h, w, 3)."""
     masks: dict[str, Mask]
-    """Name -> (frames, h, w), of the masks that are not empty: surfaces that a neighbouring frame hides, objects that
-    move, light that changes, mirrors and glass."""
+    """Name -> (frames, h, w), of the masks that are not empty: ``disocclusion``, surfaces that a neighbouring frame
+    hides, and ``light`` that changes."""
 
     @property
     def name(self) -> str:
@@ -60,7 +58,7 @@ def load(folder: Path, motion_format: str | None = None) -> Sequence:
     """
     numbers = sorted(int(path.suffixes[0][1:]) for path in folder.glob("hr.*.exr"))
     of_references = numbers[:1] if folder.name == STATIC else numbers
-    names = [f"{kind}.{n:04d}.exr" for kind in ("full", "lr_x2", "lr_x4", "mask") for n in numbers]
+    names = [f"{kind}.{n:04d}.exr" for kind in ("full", "lr_x2", "lr_x4") for n in numbers]
     names += [f"ref_{half}.{n:04d}.exr" for half in "ab" for n in of_references]
     missing = [name for name in names if not (folder / name).exists()]
     if len(numbers) < 2 or missing:
@@ -68,8 +66,7 @@ def load(folder: Path, motion_format: str | None = None) -> Sequence:
     halves = [np.stack([beauty(map_render(open_exr(folder / f"ref_{half}.{n:04d}.exr"))) for n in of_references])
               for half in "ab"]  # fmt: skip
     truth = tuple(np.broadcast_to(half, (len(numbers), *half.shape[1:])) for half in halves)
-    marked = [_channels(folder / f"mask.{n:04d}.exr") for n in numbers]
-    back, forth = _motion(folder, numbers, marked, motion_format)
+    back, forth = _motion(folder, numbers, motion_format)
     seen = [_returns(forth[t], back[t + 1]) for t in range(len(numbers) - 1)]
     seen_before = [_returns(back[t + 1], forth[t]) for t in range(len(numbers) - 1)]
     everywhere = np.ones((1, *seen[0].shape), bool)
@@ -79,9 +76,8 @@ def load(folder: Path, motion_format: str | None = None) -> Sequence:
     for t in range(len(numbers) - 1):
         light[t] |= seen[t] & _differs(pictures, t, t + 1, forth[t])
         light[t + 1] |= seen_before[t] & _differs(pictures, t + 1, t, back[t + 1])
-    moves, reflects = (np.stack([mark[name] > 0 for mark in marked]) for name in ("moves.Y", "reflects.Y"))
-    masks = dict(zip(MASKS, (hidden, moves, light, reflects), strict=True))
-    return Sequence(folder, numbers, (truth[0], truth[1]), {name: mask for name, mask in masks.items() if mask.any()})
+    masks = {name: mask for name, mask in (("disocclusion", hidden), ("light", light)) if mask.any()}
+    return Sequence(folder, numbers, (truth[0], truth[1]), masks)
 
 
 def without_vectors(sequence: Sequence, folder: Path) -> Sequence:
@@ -110,16 +106,15 @@ def write_one_render(sequence: Sequence, number: int, path: Path) -> None:
 
 def _channels(path: Path) -> dict[str, Array]:
     """Return all channels (h, w) of a file, by name."""
-    image: Any = oiio.ImageBuf(str(path))
-    return dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), -1, 0), strict=True))
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: channel.pixels for name, channel in file.channels().items()}
 
 
-def _motion(
-    folder: Path, numbers: list[int], marked: list[dict[str, Array]], motion_format: str | None
-) -> tuple[list[Array], list[Array]]:
+def _motion(folder: Path, numbers: list[int], motion_format: str | None) -> tuple[list[Array], list[Array]]:
     """Return vectors (h, w, 2) from each frame to the previous and the next one: exact ones, or the renderer's."""
-    if MOTION[0] in marked[0]:
-        stored = [np.stack([mark[name] for name in MOTION], axis=-1) for mark in marked]
+    renders = [_channels(folder / f"hr.{n:04d}.exr") for n in numbers]
+    if MOTION[0] in renders[0]:
+        stored = [np.stack([render[name] for name in MOTION], axis=-1, dtype=np.float32) for render in renders]
         return [vectors[..., :2] for vectors in stored], [vectors[..., 2:] for vectors in stored]
     frames = [MotionFrame(map_render(open_exr(folder / f"hr.{n:04d}.exr"))) for n in numbers]
     source = find_motion(frames[0].hr, frames[1].hr, motion_format, required=True)
@@ -140,5 +135,8 @@ def _returns(vectors: Array, back: Array) -> Mask:
 
 def _differs(pictures: tuple[Array, Array], t: int, other: int, vectors: Array) -> Mask:
     """Return where a frame of the reference differs from another one that is brought to its place."""
-    first, second = (half[t] - warped(half[other], vectors) for half in pictures)
-    return blur((first * second).mean(axis=-1)[None, ..., None], CHANGED_BLUR)[0, ..., 0] > CHANGED**2
+    height, width = vectors.shape[:2]
+    y, x = np.mgrid[0:height, 0:width] + np.moveaxis(vectors, -1, 0)[::-1]
+    warped = sample_cubic([half[other] for half in pictures], lambda rows: (x[rows], y[rows]), (height, width))
+    first, second = (half[t] - moved for half, moved in zip(pictures, warped, strict=True))
+    return np.asarray(blurred((first * second).mean(axis=-1), BLURS) > CHANGED**2)

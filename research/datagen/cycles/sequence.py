@@ -4,9 +4,7 @@
     python -m research.datagen.cycles.sequence SEQUENCES
 
 The camera trucks through a plain room in which a cube slides and turns. The files are those of
-:mod:`research.benchmarks.render.sequences`, as multi-layer EXRs of Blender itself; ``mask.####.exr`` says where the
-cube is.
-Files that exist are kept.
+:mod:`research.benchmarks.render.sequences`, as multi-layer EXRs of Blender itself. Files that exist are kept.
 """
 
 from __future__ import annotations
@@ -17,8 +15,6 @@ import time
 from pathlib import Path
 
 import bpy
-import numpy as np
-import OpenImageIO as oiio
 
 from . import materials as mat
 from .render import set_up, write_frame
@@ -44,7 +40,7 @@ def material(
 
 
 def build() -> None:
-    """Make the room. The cube that moves has the pass index 1."""
+    """Make the room."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
     scene = bpy.context.scene
@@ -69,7 +65,6 @@ def build() -> None:
     add("cylinder", tiles, radius=0.25, depth=1.6, location=(-0.4, 1.9, 0.8))
     add("torus", marble, location=(1.0, 0.2, 0.12), major_radius=0.3, minor_radius=0.12)
     cube = add("cube", tiles, size=0.6, location=(0, 0, 0.3))
-    cube.pass_index = 1
     for location, size, power in (((1.5, -1.0, 3.2), 0.5, 160.0), ((-2.0, 0.5, 2.8), 0.3, 60.0)):
         bpy.ops.object.light_add(type="AREA", location=location)
         lamp = bpy.context.object
@@ -86,20 +81,6 @@ def build() -> None:
         cube.keyframe_insert("rotation_euler", frame=frame)
 
 
-def write_mask(render: Path, path: Path) -> None:
-    """Where the moving object is in a render."""
-    image = oiio.ImageBuf(str(render))
-    names = image.spec().channelnames
-    index = next(i for i, name in enumerate(names) if name.endswith(".Object Index.X"))
-    moves = np.asarray(image.get_pixels(oiio.FLOAT))[..., index : index + 1] > 0.5
-    spec = oiio.ImageSpec(*SIZE, 2, "half")
-    spec.channelnames = ("moves.Y", "reflects.Y")
-    mask = oiio.ImageBuf(spec)
-    mask.set_pixels(oiio.ROI(), np.concatenate([moves, np.zeros_like(moves)], axis=-1).astype(np.float32))
-    if not mask.write(str(path)):
-        raise SystemExit(f"{path}: {mask.geterror()}")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
@@ -112,7 +93,7 @@ def main() -> None:
     scene.cycles.pixel_filter_type, scene.cycles.max_bounces = "BOX", 8
     scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = scene.render.use_motion_blur = False
     layer = scene.view_layers[0]
-    layer.use_pass_vector = layer.use_pass_object_index = layer.use_pass_position = True
+    layer.use_pass_vector = layer.use_pass_position = True
     layer.cycles.denoising_store_passes = True
     kinds = [("hr", 1, 1), ("full", 1, 2), *((f"lr_x{s}", s, s * s) for s in SCALES)]
     for frame in range(1, FRAMES + 1):
@@ -121,7 +102,6 @@ def main() -> None:
             path = folder / f"{kind}.{frame:04d}.exr"
             if not path.exists():
                 write_frame(scene, path, [side // scale for side in SIZE], spp, path.name)
-        write_mask(folder / f"hr.{frame:04d}.exr", folder / f"mask.{frame:04d}.exr")
         print(f"frame {frame}: {time.perf_counter() - start:.0f} s", flush=True)
 
 

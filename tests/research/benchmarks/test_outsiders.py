@@ -9,7 +9,6 @@ import pytest
 from research.benchmarks import outsiders
 from research.benchmarks.outsiders import MOTION, Extent, Renderer
 from research.benchmarks.render.film import write_exr
-from research.benchmarks.shots.measures import blur, motion_error
 from tests.conftest import noisy, picture
 
 RGB = ("R", "G", "B")
@@ -36,17 +35,6 @@ def test_a_shot_has_the_flicker_of_its_frames(tmp_path):
     steady, rough = (outsiders._scores(tmp_path, tmp_path / name) for name in ("steady", "noisy"))
     assert steady["flicker"] == 0 and steady["relmse"] == 0 and steady["flip"] == pytest.approx(0, abs=1e-4)
     assert rough["flicker"] > 0.01 and rough["psnr"] < 40
-    assert steady["motion_error"] == 0 and rough["motion_error"] > 0.01
-
-
-def test_motion_error_is_the_distance_of_the_motions_in_pixels():
-    rng = np.random.default_rng(0)
-    wall = np.repeat(blur(rng.random((1, 96, 160, 1), np.float32), 2.0), 3, axis=-1)[0]
-    wall = (wall - wall.min()) / np.ptp(wall)
-    still, slow, fast = (np.stack([wall[:, step * at : step * at + 120] for at in range(4)]) for step in (0, 1, 3))
-    assert motion_error(slow, slow) == 0
-    assert motion_error(slow, still) == pytest.approx(1, abs=0.1)
-    assert motion_error(fast, slow) == pytest.approx(2, abs=0.2)
 
 
 def test_what_is_measured_is_not_measured_again(tmp_path, monkeypatch):

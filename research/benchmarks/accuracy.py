@@ -12,12 +12,11 @@ spp_HRLS.
 Methods that get an LRHS and an HRLS, each with half of the samples as in the paper:
 
 - the models of this project, by name. "joint-x2, 3:1" has three quarters of the samples in the HRLS.
-- "OIDN on both x2, together": OIDN on the HRLS, with the local means of
-  :func:`research.benchmarks.peers.oidn_on_average`. "OIDN prefiltered on both x2, together" has prefiltered OIDN on
-  the HRLS.
+- "OIDN prefiltered on both x2, together": prefiltered OIDN on the HRLS, with the local means of
+  :func:`research.benchmarks.peers.oidn_on_average`.
 
-Methods that get one render: "HRLS", "LRHS x2 bicubic", "OIDN on the HRLS" (half of the samples), and "OIDN, same
-samples" (all samples at full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
+Methods that get one render: "HRLS", "OIDN on the HRLS" (half of the samples), and "OIDN, same samples" (all samples at
+full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
 :func:`research.benchmarks.oidn.denoise_prefiltered`. "OIDN prefiltered and split" is that on every second pixel. All
 others are OIDN's plain call with the quality "high".
 """
@@ -34,7 +33,7 @@ import numpy as np
 
 from oiio_msspl import fuse
 from oiio_msspl.aovs.mapped_render import ReadableRender
-from oiio_msspl.compare import scores, upsample_bicubic
+from oiio_msspl.compare import scores
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.model.catalogue import load_model, shipped_models
@@ -53,8 +52,6 @@ UNEVEN = ((3, 1), (7, 1))
 MEASURES = {
     "psnr": ("PSNR (sRGB, dB)", "{:.2f}"),
     "relmse": ("RelMSE (0.5, 0.01)", "{:.4f}"),
-    "relmse_gharbi": ("RelMSE (1, 1e-4)", "{:.3f}"),
-    "ssim": ("SSIM", "{:.4f}"),
     "flip": ("FLIP", "{:.4f}"),
 }
 #: A function that computes a picture (h, w, 3).
@@ -66,9 +63,9 @@ KEYS = ("scene", "spp", "method")
 def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Iterator[tuple[str, Picture]]:
     """Yield every method's name, and a function that computes its picture (h, w, 3) for this scene and average spp."""
     hr, full = scene.hrls(spp // 2), scene.hrls(spp)
-    denoised, prefiltered = functools.cache(partial(oidn, hr)), functools.cache(partial(oidn_prefiltered, hr))
+    prefiltered = functools.cache(partial(oidn_prefiltered, hr))
     yield "HRLS", partial(beauty, hr)
-    yield "OIDN on the HRLS", denoised
+    yield "OIDN on the HRLS", partial(oidn, hr)
     yield "OIDN fast on the HRLS", partial(oidn, hr, "fast")
     yield "OIDN prefiltered on the HRLS", prefiltered
     yield "OIDN, same samples", partial(oidn, full)
@@ -76,9 +73,7 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
     yield "OIDN prefiltered and split, same samples", partial(oidn_split, full)
     for scale in SCALES:
         lr = scene.lrhs(scale, spp // 2)
-        yield f"LRHS x{scale} bicubic", partial(_enlarged, lr, scene.reference.shape)
-        for call, picture in (("OIDN", denoised), ("OIDN prefiltered", prefiltered)):
-            yield f"{call} on both x{scale}, together", partial(_joined, picture, lr, hr)
+        yield f"OIDN prefiltered on both x{scale}, together", partial(_joined, prefiltered, lr, hr)
         for session in sessions:
             if session.contract.scale == scale:
                 yield session.name, partial(_fused, session, lr, hr)
@@ -92,7 +87,6 @@ def _uneven_methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) 
         if rest or not scene.has(unit * more):
             continue
         hr, division = scene.hrls(unit * more), f"{more}:{less}"
-        yield f"OIDN on the HRLS, {division}", partial(oidn, hr)
         yield f"OIDN prefiltered on the HRLS, {division}", partial(oidn_prefiltered, hr)
         for session in sessions:
             lr = scene.lrhs(session.contract.scale, unit * less)
@@ -101,10 +95,6 @@ def _uneven_methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) 
 
 def _fused(session: Session, lr: ReadableRender, hr: ReadableRender) -> Array:
     return fuse(lr, hr, session).rgb
-
-
-def _enlarged(lr: ReadableRender, shape: Sequence[int]) -> Array:
-    return upsample_bicubic(beauty(lr), shape[1], shape[0])
 
 
 def _joined(picture: Picture, lr: ReadableRender, hr: ReadableRender) -> Array:

@@ -4,8 +4,8 @@
     python -m research.benchmarks.filters VIEWS --table research/benchmarks/results/filters.csv
 
 VIEWS keep their samples (:mod:`research.datagen.samples`). Those that no network was trained on are used: the splits
-``validation``, whose references Open Image Denoise (OIDN) has cleaned, and ``test``. Each filter gives an HRLS of 1 and
-4 spp, an LRHS of half the size that is filtered in its own pixels and has as many samples, and a reference.
+``validation``, whose references Open Image Denoise (OIDN) has cleaned, and ``test``. Each filter gives an HRLS of 1
+spp, an LRHS of half the size that is filtered in its own pixels and has as many samples, and a reference.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from oiio_msspl import Render, fuse
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.image.arrays import Array
-from oiio_msspl.image.metrics import psnr, relmse
+from oiio_msspl.image.metrics import psnr
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.encoding import find_exposure
 from research.benchmarks import results
@@ -43,7 +43,7 @@ FILTERS = (
     PixelFilter("box", 0.5),
     PixelFilter("blackman-harris", 0.75, splatted=False),
 )
-SCALE, SPP = 2, (1, 4)
+SCALE, SPP = 2, 1
 MODELS = ("joint-x2", "joint-large-x2", "joint-spread-x2", "joint-large-spread-x2")
 OIDN = "OIDN prefiltered on the HRLS"
 FEATURES = (RGB, ALBEDO, NORMAL)
@@ -51,19 +51,19 @@ FEATURES = (RGB, ALBEDO, NORMAL)
 STORED = {RGB: "color", ALBEDO: ALBEDO, NORMAL: NORMAL}
 
 
-def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, spp: int, scale: int) -> dict[str, Array]:
-    """Return the layers of a render with ``spp`` samples for each HRLS pixel, (h, w, 3) by name."""
+def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, scale: int) -> dict[str, Array]:
+    """Return the layers of a render with ``SPP`` samples for each HRLS pixel, (h, w, 3) by name."""
     rows, columns = (slice(0, side) for side in view.size)
     stored = len(view.arrays[f"{prefix}color"])
-    samples = torch.arange(min(pixel_filter.samples_for(spp), stored))
+    samples = torch.arange(min(pixel_filter.samples_for(SPP), stored))
     values = [view.read(prefix + STORED[name], samples, rows, columns) for name in FEATURES]
     place = view.read(f"{prefix}place", samples, rows, columns)
     generator = torch.Generator().manual_seed(scale)
-    mean = apply(pixel_filter, place, torch.cat(values, dim=1), scale, spp * scale**2, generator)
+    mean = apply(pixel_filter, place, torch.cat(values, dim=1), scale, SPP * scale**2, generator)
     return {name: part.movedim(0, -1).numpy() for name, part in zip(FEATURES, mean.split(3), strict=True)}
 
 
-def pair(view: SampleView, pixel_filter: PixelFilter, spp: int) -> tuple[Render, Render, Array]:
+def pair(view: SampleView, pixel_filter: PixelFilter) -> tuple[Render, Render, Array]:
     """Return LRHS, HRLS and reference (h, w, 3), exposed."""
     tensors = SampleTensors(view, torch.device("cpu"))
     cells = decode_radiance(tensors.arrays["ref"][None])[0]
@@ -71,27 +71,26 @@ def pair(view: SampleView, pixel_filter: PixelFilter, spp: int) -> tuple[Render,
     exposure = np.float32(find_exposure(reference))
     renders = []
     for prefix, scale in (("lr_", SCALE), ("", 1)):
-        layers = filtered(tensors, prefix, pixel_filter, spp, scale)
+        layers = filtered(tensors, prefix, pixel_filter, scale)
         layers[RGB] = np.maximum(layers[RGB], 0) * exposure  # filters with negative lobes
         renders.append(Render.from_arrays(f"{prefix}{view.path.name}", **layers))
     return renders[0], renders[1], reference * exposure
 
 
 def measure(views: list[SampleView]) -> Iterator[Row]:
-    """Yield a row for each filter, spp and method."""
+    """Yield a row for each filter and method."""
     sessions = {name: load_model(SCALE, name) for name in MODELS}
     for pixel_filter in FILTERS:
         way = "" if pixel_filter.splatted else ", importance sampled"
         kind = f"{pixel_filter.kind}, radius {pixel_filter.radius}{way}"
-        for spp in SPP:
-            pairs = [pair(view, pixel_filter, spp) for view in views]
-            for method in (OIDN, *sessions):
-                scores = []
-                for lrhs, hrls, reference in pairs:
-                    image = oidn_prefiltered(hrls) if method == OIDN else fuse(lrhs, hrls, sessions[method]).rgb
-                    scores.append((psnr(image, reference), relmse(image, reference)))
-                row = dict(zip(("psnr", "relmse"), map(statistics.fmean, zip(*scores, strict=True)), strict=True))
-                yield {"filter": kind, "spp": 2 * spp, "method": method, **results.model_of(method), **row}
+        pairs = [pair(view, pixel_filter) for view in views]
+        for method in (OIDN, *sessions):
+            scores = []
+            for lrhs, hrls, reference in pairs:
+                image = oidn_prefiltered(hrls) if method == OIDN else fuse(lrhs, hrls, sessions[method]).rgb
+                scores.append(psnr(image, reference))
+            row: Row = {"filter": kind, "spp": 2 * SPP, "method": method, **results.model_of(method)}
+            yield row | {"psnr": statistics.fmean(scores)}
 
 
 def main() -> None:

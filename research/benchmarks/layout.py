@@ -76,7 +76,6 @@ class Table:
         """Lay the table out, with what its rows were measured with."""
         rows = [row | {"source": name} for name in self.sources for row in results.read(name)]
         for row in rows:
-            row["kind"] = row.get("kind", re.sub(r"_\d+$", "", row.get("layer", "")))  # lamps count as one layer
             row["family"] = re.sub(r"-x\d$", "", row.get("method", ""))
         peers = results.index(rows, "source", *self.keys)
         used: list[Row] = []

@@ -41,7 +41,6 @@ Method = tuple[str, str | None, Callable[[], Array]]
 def of_one(scene: scenes.Scene, spp: int) -> Iterator[Method]:
     """Yield every method that gets one render or a pair of two sizes."""
     render = scene.hrls(spp)
-    yield "render", None, partial(scenes.beauty, render)
     yield "OIDN", None, partial(oidn, render)
     yield "OIDN prefiltered", None, partial(oidn_prefiltered, render)
     yield from _chosen(render, render)
@@ -55,7 +54,6 @@ def of_two(scene: scenes.Scene, spp: tuple[int, int]) -> Iterator[Method]:
     share = spp[0] / sum(spp)
     low, high = (render.read(render.data_window) for render in (first, second))
     mean = Render.from_arrays("mean", **{name: share * low[name] + (1 - share) * high[name] for name in high})
-    yield f"render{SEEDS}", None, partial(scenes.beauty, mean)
     yield f"OIDN{SEEDS}", None, partial(oidn, mean)
     yield f"OIDN prefiltered{SEEDS}", None, partial(oidn_prefiltered, mean)
     for method, model, picture in _chosen(first, second, share):

@@ -14,8 +14,6 @@ PASSES is made by :mod:`research.benchmarks.render.passes` and ``research.datage
 - "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
 - "msspl, best, at half size": light groups at half of the frame's resolution, as if there were many of them.
 
-At a scale of 1, "msspl" fuses the ordinary render alone.
-
 Light and colour that are stored apart are multiplied first. A layer with less than `FAINT` of the beauty's light is
 part of the sum, but is not scored: every method has a high PSNR there.
 
@@ -48,12 +46,11 @@ from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.jobs.settings import family_for_noise
 from oiio_msspl.model.catalogue import load_model
-from oiio_msspl.model.contract import ONE_SIZE
 from research.benchmarks import results, timer
 from research.benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
 from research.benchmarks.results import MEAN, Row
 
-SCALES, SPP = (2, 4, ONE_SIZE), (1, 2)
+SCALES, SPP = (2, 4), (1, 2)
 KEYS = ("scene", "set", "spp", "method")
 #: Calls of OIDN before the one that is the unit of time: the first one loads its network.
 WARM_UP = 2
@@ -93,13 +90,13 @@ def methods(
     hr: MappedRender,
     fused: Mapping[str, tuple[FusedFrame, Session]],
     layers: AdditiveSet,
-    ordinary: MappedRender | None = None,
+    ordinary: MappedRender,
 ) -> Iterator[tuple[str, Callable[[], Array]]]:
     """Yield the name of each method, and a function that computes the layers.
 
     Args:
         fused: the fused frame of each model, and the model.
-        ordinary: a render with as many samples as LRHS and HRLS together. Without it, its method is left out.
+        ordinary: a render with as many samples as LRHS and HRLS together.
     """
     noisy, colours = layers_of(hr, layers), colours_of(hr, layers)
     guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
@@ -118,11 +115,10 @@ def methods(
 
     yield "HRLS", lambda: noisy
     yield PEER, lambda: rescaled(recommended(noisy, guides), fused[BEST][0].rgb)
-    if ordinary is not None:
-        theirs = layers_of(ordinary, layers_like(ordinary, layers))
-        pixels = ordinary.load().layers
-        total = np.maximum(denoise_prefiltered(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]), 0)
-        yield "OIDN, ordinary render", lambda: rescaled(recommended(theirs, pixels), total)
+    theirs = layers_of(ordinary, layers_like(ordinary, layers))
+    pixels = ordinary.load().layers
+    total = np.maximum(denoise_prefiltered(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]), 0)
+    yield "OIDN, ordinary render", lambda: rescaled(recommended(theirs, pixels), total)
     yield "msspl", lambda: ours(BALANCED)
     yield "msspl, best", lambda: ours(BEST)
     if layers.name == LIGHT_GROUPS:
@@ -157,28 +153,14 @@ def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
     return [{"layer": ALL} | {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "relmse")}, *rows]
 
 
-def model_used(method: str, fused: Mapping[str, tuple[FusedFrame, Session]]) -> Row:
-    """Return the column ``model`` of a method: the model of its beauty, to which `PEER` is rescaled, too."""
-    if method != PEER and not method.startswith("msspl"):
-        return {}
-    _, session = fused[BEST if method == PEER or "best" in method else BALANCED]
-    return {"model": session.name}
-
-
 def measure(folder: Path, scale: int, spp: int, known: Collection[tuple[object, ...]] = ()) -> list[Row]:
     """Measure one scene: rows for each set and method, without those whose `KEYS` are known."""
 
     def opened(name: str) -> MappedRender:
         return map_render(open_exr(folder / f"{name}.exr"))
 
-    reference = opened("ref")
-    ordinary = opened(f"hr_{2 * spp}spp") if (folder / f"hr_{2 * spp}spp.exr").exists() else None
-    if scale > ONE_SIZE:
-        lr, hr = opened(f"lr_x{scale}_{scale**2 * spp}spp"), opened(f"hr_{spp}spp")
-    elif ordinary is not None:
-        lr = hr = ordinary
-    else:
-        return []
+    reference, ordinary = opened("ref"), opened(f"hr_{2 * spp}spp")
+    lr, hr = opened(f"lr_x{scale}_{scale**2 * spp}spp"), opened(f"hr_{spp}spp")
     fused = fused_frames(lr, hr, scale)
     pixels = hr.load().layers
     plain = partial(denoise, pixels["rgb"], pixels[ALBEDO], pixels[NORMAL])
@@ -195,7 +177,8 @@ def measure(folder: Path, scale: int, spp: int, known: Collection[tuple[object, 
             made = function()
             seconds = time.perf_counter() - start
             total, *single = scores(made, clean, [layer.name for layer in layers.layers])
-            key |= model_used(name, fused)
+            if name == PEER or name.startswith("msspl"):  # the beauty to which the peer is rescaled is that of `best`
+                key["model"] = fused[BEST if name == PEER or "best" in name else BALANCED][1].name
             rows += [key | total | {"time": 0.0 if name == "HRLS" else seconds / oidn_seconds}]
             rows += [key | row for row in single]
     return rows

@@ -10,7 +10,7 @@
   a program that denoises the full-resolution render with prefiltered Open Image Denoise (OIDN).
 - ``frame``: the call on arrays alone, as in the paper's table of runtimes.
 - ``shots``: :mod:`research.benchmarks.shots.moving_wall`, frame by frame and averaged with neighbours.
-- ``render``: Mitsuba 3 on the development scenes, for one sample in each of 1024 x 1024 pixels.
+- ``render``: Mitsuba 3 on the development scenes, for one sample in each of 1024 x 1024 pixels of an HRLS.
 
 :mod:`research.benchmarks.timer` runs each in a fresh process, in turn with the others.
 """
@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-import os
 import statistics
 import sys
 import tempfile
@@ -50,8 +49,8 @@ SAME_WORK = {
 }
 #: Values of ``--temporal``: the first one is what the others are compared with.
 WAYS = ("off", "2", "auto")
-#: spp and scale with which rendering is timed.
-RENDER_SPP, RENDER_SCALE = 4, 4
+#: spp with which rendering is timed.
+RENDER_SPP = 4
 MEGAPIXEL = 1024 * 1024
 
 
@@ -144,7 +143,7 @@ def time_command(args: argparse.Namespace) -> list[Row]:
         runs = timer.in_turn(jobs, args.rounds)
     size = {"size": f"{width}x{height}", "scale": args.scale}
     return [
-        {"method": name, **size, **results.model_of(name), **timer.summary(done), "load": os.getloadavg()[2]}
+        {"method": name, **size, **results.model_of(name), **timer.summary(done)}
         | (oidn_version() if name == OIDN_PREFILTERED else {})
         for name, done in runs.items()
     ]
@@ -181,31 +180,27 @@ def time_shots(args: argparse.Namespace) -> list[Row]:
     ]
 
 
-def _render(mi: Any, scene: Any, integrator: Any, spp: int) -> Any:
-    return mi.render(scene, integrator=integrator, spp=spp).numpy()
+def _render(mi: Any, scene: Any, integrator: Any) -> Any:
+    return mi.render(scene, integrator=integrator, spp=RENDER_SPP).numpy()
 
 
 def time_render(args: argparse.Namespace) -> list[Row]:
-    """Time one sample in each of 1024 x 1024 pixels of every scene, for either render."""
+    """Time one sample in each of 1024 x 1024 pixels of every scene."""
     import mitsuba as mi
 
     from research.benchmarks.render.film import CROP, frame_size, set_crop
 
     mi.set_variant("llvm_ad_rgb")
-    rows = []
+    rows: list[Row] = []
     for path in sorted(args.scenes.glob("*/*.xml")):
         scene, path_tracer = mi.load_file(str(path)), {"type": "path", "max_depth": 12}
         integrator: Any = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,nn:sh_normal", "img": path_tracer})
         sensor = scene.sensors()[0]
         parameters, full = mi.traverse(sensor), frame_size(sensor)
-        row: Row = {"scene": path.parent.name}
-        for name, scale in (("hrls_s", 1), ("lrhs_s", RENDER_SCALE)):
-            size, crop, spp = full // scale, np.array(CROP) // scale, RENDER_SPP * scale**2
-            set_crop(mi, parameters, size, crop, (size - crop) // 2)
-            render = partial(_render, mi, scene, integrator, spp)
-            seconds = statistics.median(timer.seconds_of(render, args.rounds))
-            row[name] = seconds * MEGAPIXEL / float(crop[0] * crop[1] * spp)
-        rows.append(row)
+        set_crop(mi, parameters, full, CROP, (full - CROP) // 2)
+        seconds = statistics.median(timer.seconds_of(partial(_render, mi, scene, integrator), args.rounds))
+        samples = CROP[0] * CROP[1] * RENDER_SPP
+        rows.append({"scene": path.parent.name, "hrls_s": seconds * MEGAPIXEL / samples})
     return rows
 
 

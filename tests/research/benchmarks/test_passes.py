@@ -53,11 +53,6 @@ def test_every_bright_layer_has_a_row_and_products_are_scored_with_their_colour(
         assert found["components", method, "Diffuse Direct"] > 20, method
 
 
-def test_without_an_ordinary_render_nothing_is_measured_at_one_size(tmp_path):
-    write_exr(tmp_path / "ref.exr", rgb(picture(SIZE, SIZE)))
-    assert passes.measure(tmp_path, 1, 4) == []
-
-
 def test_means_are_over_all_scenes_and_as_old_as_their_oldest_row(rows):
     stamped = [row | {"date": "2026-01-02"} for row in rows]
     better = [row | {"scene": "other", "psnr": row["psnr"] + 3, "date": "2026-01-01"} for row in rows]

@@ -70,21 +70,17 @@ def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
     device.commit()
     rng = np.random.default_rng(0)
     buffers = {}
-
-    def image(key: str) -> Any:
-        """Return a picture in the GPU's memory."""
-        if key not in buffers:
-            pixels = rng.random((height, width, 3), np.float32)
-            buffers[key] = pyoidn.Buffer(device, pixels.nbytes, storage=pyoidn.OIDN_STORAGE_DEVICE)
-            buffers[key].write(0, pixels.nbytes, pixels)
-        return buffers[key]
+    for key in ("color", "albedo", "normal", "clean albedo", "clean normal", "result"):
+        pixels = rng.random((height, width, 3), np.float32)
+        buffers[key] = pyoidn.Buffer(device, pixels.nbytes, storage=pyoidn.OIDN_STORAGE_DEVICE)
+        buffers[key].write(0, pixels.nbytes, pixels)
 
     def built(inputs: dict[str, str], output: str, **flags: bool) -> Any:
         """Return a filter that reads and writes the named pictures."""
         oidn_filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
         oidn_filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{OIDN[name].upper()}"))
         for role, key in {**inputs, "output": output}.items():
-            oidn_filter.set_image(role, image(key), pyoidn.OIDN_FORMAT_FLOAT3, width, height)
+            oidn_filter.set_image(role, buffers[key], pyoidn.OIDN_FORMAT_FLOAT3, width, height)
         for flag, value in flags.items():
             oidn_filter.set_bool(flag, value)
         oidn_filter.set_float("inputScale", 1.0)

@@ -215,12 +215,11 @@ def rows_of(name: str, views: list[View], processes: int) -> list[results.Row]:
     strangers = [next(v for v in views[i:] + views if v.scene != view.scene) for i, view in enumerate(views)]
     with ProcessPoolExecutor(processes) as pool:
         outcomes = [outcome for outcomes in pool.map(measure, views, strangers) for outcome in outcomes]
-    for kind, warnings in outcomes:
-        if kind in (RIGHT, RIGHT_QUARTER) and warnings:
-            print(f"{kind}: {'; '.join(warnings)}", flush=True)
     by_kind: dict[str, list[bool]] = {}
     for kind, warnings in outcomes:
         by_kind.setdefault(kind, []).append(bool(warnings))
+        if kind in (RIGHT, RIGHT_QUARTER) and warnings:
+            print(f"{kind}: {'; '.join(warnings)}", flush=True)
     return [{"scenes": name, "pairs": kind, "count": len(w), "after": sum(w)} for kind, w in by_kind.items()]
 
 

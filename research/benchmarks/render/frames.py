@@ -49,13 +49,6 @@ def render(mi: Any, file: Path, out: Path, camera: str) -> None:
     distance = float(scene.ray_intersect(ray).t.numpy()[0])
     distance = distance if np.isfinite(distance) else 5.0
 
-    def shoot(to_world: NDArray[Any], scale: int, spp: int, seed: int) -> NDArray[Any]:
-        parameters["to_world"] = mi.Transform4f(mi.Matrix4f(to_world))
-        size = [int(v) // scale for v in frame]
-        set_crop(mi, parameters, size, size, (0, 0))
-        image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), np.float32)
-        return np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
-
     jobs = [(f"hr_{spp}spp", 1, spp, 0.0) for spp in HRLS] + [("next_1spp", 1, 1, PAN)]
     jobs += [(f"lr_x{scale}_{scale**2 * n}spp", scale, scale**2 * n, 0.0) for scale in SCALES for n in LRHS]
     angle, share = CAMERAS[camera]
@@ -64,9 +57,14 @@ def render(mi: Any, file: Path, out: Path, camera: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, scale, spp, pan in jobs:
         path = folder / f"{name}.exr"
-        if not path.exists():
-            seed = zlib.crc32(f"{folder.name} {name}".encode())
-            write_exr(path, shoot(orbit @ _turn(pan), scale, spp, seed), CHANNELS)
+        if path.exists():
+            continue
+        parameters["to_world"] = mi.Transform4f(mi.Matrix4f(orbit @ _turn(pan)))
+        size = [int(v) // scale for v in frame]
+        set_crop(mi, parameters, size, size, (0, 0))
+        seed = zlib.crc32(f"{folder.name} {name}".encode())
+        image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed), np.float32)
+        write_exr(path, np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0), CHANNELS)
 
 
 def _turn(degrees: float) -> NDArray[Any]:

@@ -22,7 +22,7 @@ def _light(*radiance: float) -> SceneDict:
     return {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
 
 
-def _walls(mi: Any, *, lamp: bool = True) -> SceneDict:
+def _walls(mi: Any) -> SceneDict:
     """Return a box from -1 to 1 that is open to the front (+z), with a lamp below its ceiling."""
     to = mi.ScalarTransform4f
     sides = {
@@ -36,10 +36,8 @@ def _walls(mi: Any, *, lamp: bool = True) -> SceneDict:
         name: {"type": "rectangle", "to_world": place, "bsdf": _diffuse(*colour)}
         for name, (place, colour) in sides.items()
     }
-    if lamp:
-        place = to().translate([0, 0.99, 0]).rotate([1, 0, 0], 90).scale(0.25)
-        scene["lamp"] = {"type": "rectangle", "to_world": place, "emitter": _light(15, 13, 10)}
-    return scene
+    place = to().translate([0, 0.99, 0]).rotate([1, 0, 0], 90).scale(0.25)
+    return scene | {"lamp": {"type": "rectangle", "to_world": place, "emitter": _light(15, 13, 10)}}
 
 
 def room(mi: Any) -> SceneDict:

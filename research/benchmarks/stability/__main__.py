@@ -73,7 +73,6 @@ def main() -> None:
     parser = results.parser(__doc__)
     parser.add_argument("--model", action="append", default=[], help="ONNX file or shipped name; repeat it for more")
     parser.add_argument("--scale", type=int, nargs="+", choices=SCALES, default=[2, 4], help="default: 2 4")
-    parser.add_argument("--size", type=int, default=SIZE, help="side of the frames (%(default)s)")
     args = parser.parse_args()
     # The models for little noise never see renders of so few samples.
     shipped = [file for name, file in shipped_models().items() if CLEAN not in name]
@@ -83,7 +82,7 @@ def main() -> None:
     rows = []
     for scale in args.scale:
         models = {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
-        rows += run(scale, models | peer, args.size)
+        rows += run(scale, models | peer, SIZE)
     results.show(judged(rows), args.table, KEYS)
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import typer
@@ -37,13 +38,5 @@ for module in (inspect, check, models, compare, fuse, submit, blender_install, n
     app.command(name.replace("_", "-"), epilog=module.EXAMPLES)(getattr(module, name))
 
 
-def msspl_fuse() -> None:
-    run(fuse_app)
-
-
-def msspl_render() -> None:
-    run(render_app)
-
-
-def msspl() -> None:
-    run(app)
+#: The programs.
+msspl_fuse, msspl_render, msspl = (partial(run, each) for each in (fuse_app, render_app, app))

@@ -181,11 +181,6 @@ class MappedRender:
                 unload(layers[name])
         return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name), stored
 
-    def check_pixels(self, channels: Sequence[Channel], features: Iterable[str]) -> None:
-        """Raise InputError if pixels that :meth:`load_with` would read can't be decoded."""
-        for window in self.data_window.bands(ROWS_PER_LOAD):
-            self._read_with(window, features, channels)
-
 
 #: A render that is read by rectangles: a file with its layers mapped, or one in memory.
 ReadableRender = MappedRender | Render

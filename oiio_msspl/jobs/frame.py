@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, VARIANCE
-from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD, MappedRender
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
@@ -238,13 +238,10 @@ def _read_pixels(frame: ShotFrame) -> None:
     start = time.perf_counter()
     memory, (low, high) = frame.memory, frame.stored
     assert memory is not None
-    if frame.plan.reach.frames:
-        # A damaged frame is left out by its neighbours, whether its pixels and vectors wait in memory or not.
-        if not memory.fits:
-            high.check_pixels(memory.motion_channels, memory.features)
-            low.check_pixels((), memory.features)
-        elif memory.motion_channels and not memory.vectors_ahead:
-            high.check_pixels(memory.motion_channels, ())
+    if memory.motion_channels and not (memory.fits and memory.vectors_ahead):
+        # A frame with damaged vectors fails, however much memory there is.
+        for window in high.data_window.bands(ROWS_PER_LOAD):
+            high.file.read(memory.motion_channels, window)
     if memory.fits:
         motion, channels = frame.plan.motion, memory.vectors_ahead
         loaded, stored = high.load_with(channels, memory.features, on_disk=memory.on_disk)

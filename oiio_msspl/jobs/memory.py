@@ -41,10 +41,10 @@ class ViewMemory:
     motion_channels: list[Channel]
     """The channels of the motion vectors; none if the motion is known otherwise."""
     fits: bool
-    """Whether there is room for the pixels of all frames that live, beside a tile and two results."""
+    """Whether the pixels of all frames that live can wait, beside a tile and two results. They can if ``on_disk``."""
     on_disk: bool
-    """Whether waiting renders are spilled to temporary files: always when several views are averaged, otherwise only if
-    a large frame and its motion vectors do not fit into memory."""
+    """Whether renders that are averaged wait in temporary files: when several views are averaged, or memory has no room
+    for them and their motion vectors."""
     vectors_ahead: list[Channel]
     """The motion vectors to read with the pixels. If they do not fit beside these, they are read later."""
     held: int
@@ -78,9 +78,9 @@ def budget_view(
     waiting += _waiting_means(lr, hr, reach)
     held = result + waiting + averaging + other_views
     room = max_memory - FIXED_MEMORY - TILE_MEMORY - _pixel_bytes(lr, features) - result - held
-    on_disk = reach.renders > 0 and (other_views > 0 or (is_large(hr) and room - pixels < vectors))
+    on_disk = reach.renders > 0 and (other_views > 0 or room - pixels < vectors)
     in_memory = 0 if on_disk else pixels
-    fits = room >= in_memory
+    fits = on_disk or room >= pixels
     vectors_ahead = channels if vectors <= room - in_memory else []
     if fits:
         held += in_memory + _vector_bytes(hr, vectors_ahead)

@@ -231,7 +231,7 @@ def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models,
     damaged.write_bytes(damaged.read_bytes()[:-2000])
 
     def budget(*view, **more):
-        return replace(budget_view(*view, **more), fits=in_memory)
+        return replace(budget_view(*view, **more), on_disk=not in_memory)
 
     monkeypatch.setattr(reading, "budget_view", budget)
     report = fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
@@ -618,10 +618,10 @@ def test_a_neighbour_with_one_damaged_pass_is_left_out_wherever_pixels_wait(tmp_
         write_exr(tmp_path / f"hr/hr.{n:04d}.exr", [(name, each, (0, 0)) for name, each in parts.items()])
     damage_pixels(tmp_path / "hr/hr.0003.exr", 1)
     fused = {}
-    for name, max_memory in (("pixels wait in memory", MAX_MEMORY), ("pixels are read twice", 1 << 29)):
+    for name, max_memory in (("pixels wait in memory", MAX_MEMORY), ("pixels wait in files", 1 << 29)):
         out = tmp_path / name
         report = fuse_shot(tmp_path / "lr", tmp_path / "hr", out, model=str(bilinear_models[4]), max_memory=max_memory)
         assert [report.results[n].status for n in range(1, 6)] == ["fused", "fused", "failed", "fused", "fused"]
         assert any("frame 3 is not averaged" in text for text in report.results[2].warnings), report.temporal
         fused[name] = contents(out)
-    assert fused["pixels wait in memory"] == fused["pixels are read twice"]
+    assert fused["pixels wait in memory"] == fused["pixels wait in files"]

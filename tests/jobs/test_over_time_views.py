@@ -234,10 +234,10 @@ def test_a_damaged_view_is_absent_wherever_renders_wait(tmp_path, bilinear_model
     path = shot / f"hr/hr.{FIRST + 3}.exr"
     cut_part(path, view)
     results = []
-    for name, fits in (("in memory", True), ("in files", False)):
+    for name, on_disk in (("in memory", False), ("in files", True)):
 
-        def budget(*view, fits=fits, **more):
-            return replace(budget_view(*view, **more), fits=fits)
+        def budget(*view, on_disk=on_disk, **more):
+            return replace(budget_view(*view, **more), on_disk=on_disk)
 
         monkeypatch.setattr(reading, "budget_view", budget)
         out = shot / name

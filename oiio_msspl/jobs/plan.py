@@ -87,8 +87,6 @@ class ShotPlan:
     """The plan of the first view, None, and of the other views that are averaged. All depend on as many frames."""
     text: str = ""
     """One sentence for the user; empty if the user has switched it off."""
-    looked_at: frozenset[str] = frozenset()
-    """All views beside the first one that were planned. ``text`` says why some are fused frame by frame."""
 
     @property
     def warnings(self) -> list[Finding]:
@@ -151,15 +149,14 @@ def plan_temporal(
     if plan is None:
         return ShotPlan(text=text)
     views: dict[str | None, ViewPlan] = {None: plan}
-    labels = _other_views(mapped, numbers[:PAIRS_JUDGED], inputs, write)
-    for label in labels:
+    for label in _other_views(mapped, numbers[:PAIRS_JUDGED], inputs, write):
         source = _motion_of(mapped, numbers, inputs, options, label, required=False)
         plan, reason = _plan_view(source, count, asked=asked)
         if plan is None:
             text += f"; {name_of(label)} {reason}"
         else:
             views[label] = plan
-    return ShotPlan(frames, views, text, frozenset(labels))
+    return ShotPlan(frames, views, text)
 
 
 def _family_of_shot(mapped: Callable[[int], MappedPair], numbers: Iterable[int], model: str | None) -> str | None:

@@ -18,7 +18,6 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, VARIANCE, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.render import Render
@@ -241,13 +240,8 @@ class ShotRun:
         report = report_on(first.lr, first.hr, first.session, picture, first.files.output, first.files.preview)
         report.layers = written_layers(first.hr, first.write)
         views = sorted(others, key=lambda other: first.hr.other_views.index(other.hr.view))
-        findings = [Finding("view_not_fused", text) for text in first.passed_on]
-        why = "is fused frame by frame: the frames by which its motion is found lack it"
-        unplanned = [
-            view.hr.view for view in first.others if self.plan.count and view.hr.view not in self.plan.looked_at
-        ]
-        findings += [Finding("not_averaged", f"{name_of(view)} {why}") for view in unplanned]
-        add_other_views(report, [view.report for view in views], findings)
+        passed_on = [Finding("view_not_fused", text) for text in first.passed_on]
+        add_other_views(report, [view.report for view in views], passed_on)
         return report
 
     def _average_results(self, frame: ShotFrame) -> FusedFrame:

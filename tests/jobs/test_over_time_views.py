@@ -189,16 +189,6 @@ def test_a_frame_may_lack_a_view(tmp_path, bilinear_models):
         assert all(same_bits(whole[name], alone[name]) for name in alone)
 
 
-def test_a_view_that_no_plan_is_about_is_said_to_stay_alone(tmp_path, bilinear_models):
-    """The motion is found by the first, the middle and the last pair of frames."""
-    shot = make_shot(tmp_path, lacking=(0, 3, 5))
-    report = run(shot, bilinear_models[4], "out")
-    said = {n: [text for text in result.warnings if "frame by frame" in text] for n, result in report.results.items()}
-    with_view = [FIRST + t for t in range(COUNT) if t not in (0, 3, 5)]
-    sentence = "bg is fused frame by frame: the frames by which its motion is found lack it"
-    assert said == {n: [sentence] if n in with_view else [] for n in report.results}
-
-
 def test_both_eyes_are_averaged(tmp_path, bilinear_models):
     """Layers of the second eye have its name before the channel's, as OpenEXR stores them."""
     for name, scale, spp in (("lr", 4, 16), ("hr", 1, 1)):

@@ -8,7 +8,6 @@ tiles share strips. A cache keeps them from one tile to the next.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,40 +30,24 @@ class StripKey(NamedTuple):
     last: int
 
 
-@dataclass
-class StripCache:
+class StripCache(dict[StripKey, NDArray[Any]]):
     """Decoded strips, up to a number of bytes.
 
     A strip is kept until a read needs other rows. One that does not fit is not kept: every tile decodes it again.
     """
 
-    max_bytes: int = 0
+    max_bytes = 0
     """Bytes that the strips may take together. With 0, nothing is kept."""
-    _strips: dict[StripKey, NDArray[Any]] = field(default_factory=dict, repr=False)
-
-    @property
-    def bytes(self) -> int:
-        """Bytes that the strips take at the moment."""
-        return sum(strip.nbytes for strip in self._strips.values())
-
-    def get(self, key: StripKey) -> NDArray[Any] | None:
-        """Return the strip, or None if it is not kept."""
-        return self._strips.get(key)
 
     def keep(self, key: StripKey, strip: NDArray[Any]) -> None:
         """Keep a strip if there is room."""
-        if self.bytes + strip.nbytes <= self.max_bytes:
-            self._strips[key] = strip
+        if sum(kept.nbytes for kept in self.values()) + strip.nbytes <= self.max_bytes:
+            self[key] = strip
 
     def drop_outside(self, first: int, last: int) -> None:
         """Forget the strips that have none of the rows from ``first`` to ``last`` (exclusive)."""
-        for key in list(self._strips):
-            if key.last <= first or key.first >= last:
-                del self._strips[key]
-
-    def clear(self) -> None:
-        """Forget all strips."""
-        self._strips.clear()
+        for key in [key for key in self if key.last <= first or key.first >= last]:
+            del self[key]
 
 
 def strip_rows(start: int, stop: int, origin: int, height: int, end: int) -> Iterator[tuple[int, int]]:

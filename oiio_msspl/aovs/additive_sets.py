@@ -130,8 +130,7 @@ class _Finder:
         entry = entry_of(candidate)
         factors = [layer.triple() for _, layer in self._named(entry["times"])] if "times" in entry else [None]
         for name, layer in self._named(entry["layer"]) if factors else ():
-            channels = layer.triple()
-            if channels and all(channel.type != "uint" for channel in channels):
+            if channels := layer.triple():
                 yield AdditiveLayer(name, channels, factors[0])
 
     def _named(self, alias: str) -> Iterator[tuple[str, Layer]]:

@@ -89,7 +89,8 @@ class LayerFinder:
         if isinstance(alias, list):
             # Of equal names, the chosen view's first one.
             layers = sorted(self._layers, key=lambda layer: layer.view != self._view)
-            stored = {c.name: c for layer in reversed(layers) for c in reversed(layer.channels.values())}
+            channels = (c for layer in reversed(layers) for c in reversed(layer.channels.values()))
+            stored = {c.name: c for c in channels if c.type != "uint"}
             return (tuple(stored[c] for c in alias), " ".join(alias)) if all(c in stored for c in alias) else None
         layer = self._layer(feature, alias)
         if layer is None:
@@ -205,7 +206,8 @@ def missing(feature: str, candidate: Any, file: ExrFile) -> str:
 def wrong_channels(feature: str, layer: Layer) -> str:
     """Return the sentence for a layer that exists but can't be the feature."""
     wanted = "R, G, B (or X, Y, Z)" + (" or a single channel" if feature == VARIANCE else "")
-    return f"{feature}: layer '{layer.name or 'R G B'}' has channels {', '.join(layer.channels)}, not {wanted}"
+    of = " of integers (ids, not light)" if any(c.type == "uint" for c in layer.channels.values()) else ""
+    return f"{feature}: layer '{layer.name or 'R G B'}' has channels {', '.join(layer.channels)}{of}, not {wanted}"
 
 
 def _text(names: Sequence[str], has_factor: bool) -> str:

@@ -59,8 +59,8 @@ def map_render(
         sums: the user's additive sets, see :func:`oiio_msspl.aovs.additive_sets.find_additive_sets`.
 
     Raises:
-        InputError: the mapping or a sum has a mistake; the file has only deep data, no beauty or no such view; a layer
-            holds integers; or a layer of the mapping is missing or has the wrong channels.
+        InputError: the mapping or a sum has a mistake; the file has only deep data, no beauty or no such view; or a
+            layer of the mapping is missing or has the wrong channels.
     """
     if all(part.deep for part in file.parts):
         raise InputError(
@@ -81,18 +81,12 @@ def map_render(
         problems: list[str] = []
         if feature not in mapping:
             candidates = (finder.formula(feature, candidate, notes) for candidate in candidates_of(renderer, feature))
-            usable = (found for found in candidates if found and not _holds_integers(feature, found, notes))
-            if formula := next(usable, None):
+            if formula := next(filter(None, candidates), None):
                 formulas[feature] = formula
         elif formula := finder.formula(feature, mapping[feature], problems):
             formulas[feature] = formula
         else:
             raise InputError(f"{file.path}: {problems[0] if problems else missing(feature, mapping[feature], file)}")
-    _check_no_integers(formulas)
-    alpha = find_alpha(layers, beauty)
-    if alpha is not None and alpha.type == "uint":
-        notes.append(f"alpha: {alpha.name} holds integers; the render counts as one without alpha")
-        alpha = None
     labels = dict.fromkeys(candidate.label for candidate in beauties)
     render = MappedRender(
         file=file,
@@ -100,7 +94,7 @@ def map_render(
         view=beauty.label,
         other_views=[label for label in labels if label != beauty.label],
         features=formulas,
-        alpha=alpha,
+        alpha=find_alpha(layers, beauty),
         spp=spp,
         data_window=file.parts[formulas[RGB].terms[0][0].part].data_window,
         additive_sets=find_additive_sets(renderer, layers, beauty, sums, file),
@@ -155,28 +149,10 @@ def _no_beauty(file: ExrFile, layers: list[Layer], mapped: Any) -> InputError:
     names = ", ".join(sorted({layer.name or " ".join(layer.channels) for layer in layers})[:12])
     if not any(layer.triple() for layer in layers):
         return InputError(
-            f"{file.path}: no beauty, no layer with R, G, B among: {names}; write the beauty as RGB, or name three "
-            "channels in a --map-file"
+            f"{file.path}: no beauty, no layer with R, G, B among: {names}; write the beauty as RGB, half or float, or "
+            "name three channels in a --map-file"
         )
     return InputError(f"{file.path}: no beauty (R, G, B) found among: {names}; name it with --map rgb=LAYER")
-
-
-def _holds_integers(feature: str, formula: FeatureFormula, notes: list[str]) -> bool:
-    """Return whether a layer that is found by its name can't be the feature, and note it."""
-    if holds := any(channel.type == "uint" for channel in formula.channels):
-        notes.append(f"{feature}: {formula.text} holds integers (ids, not light), so it is not read")
-    return holds
-
-
-def _check_no_integers(formulas: dict[str, FeatureFormula]) -> None:
-    for feature, formula in formulas.items():
-        if integers := [c for c in formula.channels if c.type == "uint"]:
-            path = integers[0].path
-            names = ", ".join(c.name for c in integers if c.path == path)
-            raise InputError(
-                f"{path}: {feature}: {names} hold integers (ids, not light); "
-                f"choose another layer with --map {feature}=LAYER"
-            )
 
 
 def _decide_normal_encoding(render: MappedRender) -> None:

@@ -64,24 +64,23 @@ def only_colour(layers: list[Layer], is_known: Callable[[str], bool]) -> list[st
 
     ``is_known`` tells it by the name of a layer. A name may occur once in each view of the file.
     """
-    colours = (layer for layer in layers if {"R", "G", "B"} <= layer.channels.keys())
-    names = {layer.name for layer in colours if layer.channels["R"].type != "uint" and not is_known(layer.name)}
+    colours = (layer for layer in layers if {"R", "G", "B"} <= layer.channels.keys() and layer.triple())
+    names = {layer.name for layer in colours if not is_known(layer.name)}
     return list(names) if len(names) == 1 else []
 
 
 def find_alpha(layers: Iterable[Layer], beauty: Beauty) -> Channel | None:
     """Return the alpha of a beauty: its own, or that of a layer of its view and view layer that holds no colour.
 
-    RenderMan writes ``a`` beside ``Ci.r``, and other programs write a layer or part ``alpha``.
+    RenderMan writes ``a`` beside ``Ci.r``, and other programs write a layer or part ``alpha``. Integers are no alpha.
     """
-    if "A" in beauty.layer.channels:
-        return beauty.layer.channels["A"]
     beside = [layer for layer in layers if layer.view == beauty.view and not layer.triple()]
-    alphas = [layer.channels.get("A") for layer in beside if layer.name == beauty.view_layer]
+    own = [beauty.layer, *(layer for layer in beside if layer.name == beauty.view_layer)]
+    alphas = [layer.channels.get("A") for layer in own]
     for layer in beside:
         if view_layer_of(layer.name, "alpha") == beauty.view_layer:
             alphas += [layer.channels.get("A"), *(layer.scalar() or ())]
-    return next(filter(None, alphas), None)
+    return next((alpha for alpha in alphas if alpha and alpha.type != "uint"), None)
 
 
 def choose_beauty(file: ExrFile, beauties: list[Beauty], wanted: str | None) -> Beauty:

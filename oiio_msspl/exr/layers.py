@@ -28,15 +28,17 @@ class Layer:
     """By component: ``R``, ``G``, ``B``, ``A``, ``X``, ``Y``, ``Z``, or else the last part of the stored name."""
 
     def triple(self) -> tuple[Channel, ...] | None:
-        """Return the channels R, G, B or X, Y, Z; None if one is missing."""
+        """Return the channels R, G, B or X, Y, Z; None if one is missing or holds integers: ids are no light."""
         for names in _TRIPLES:
-            if all(n in self.channels for n in names):
-                return tuple(self.channels[n] for n in names)
+            channels = tuple(self.channels[n] for n in names if n in self.channels)
+            if len(channels) == 3 and all(channel.type != "uint" for channel in channels):
+                return channels
         return None
 
     def scalar(self) -> tuple[Channel, ...] | None:
-        """Return the only channel as a tuple of one; None if the layer has several."""
-        return tuple(self.channels.values()) if len(self.channels) == 1 else None
+        """Return the only channel as a tuple of one; None if the layer has several, or if it holds integers."""
+        channels = tuple(self.channels.values())
+        return channels if len(channels) == 1 and channels[0].type != "uint" else None
 
 
 def layers_of(file: ExrFile, *, deep: bool = False) -> list[Layer]:

@@ -14,7 +14,7 @@ from tests.exr.sources import behind_a_deep_part
 
 def test_integers_are_no_light(tmp_path):
     ids = {c: np.full((H, W), 4000, np.uint32) for c in "RGB"}
-    with pytest.raises(InputError, match="rgb: R, G, B hold integers"):
+    with pytest.raises(InputError, match="no layer with R, G, B among"):
         mapped(tmp_path, ids)
 
 
@@ -23,14 +23,16 @@ def test_an_aov_of_integers_does_not_refuse_the_frame(tmp_path):
     channels = layer("", 1) | {f"albedo.{c}": np.full((H, W), 4000, np.uint32) for c in "RGB"}
     render = mapped(tmp_path, channels)
     assert sources(render) == {"rgb": "R G B"}
-    assert render.notes == ["albedo: albedo holds integers (ids, not light), so it is not read"]
+    assert render.notes == [
+        "albedo: layer 'albedo' has channels R, G, B of integers (ids, not light), not R, G, B (or X, Y, Z)"
+    ]
     assert sources(mapped(tmp_path, channels | layer("basecolor", 2)))["albedo"] == "basecolor"
 
 
 def test_an_alpha_of_integers_is_none(tmp_path):
     render = mapped(tmp_path, layer("", 1) | {"A": np.ones((H, W), np.uint32)})
     assert render.alpha is None and [c.name for c in render.beauty_channels] == ["R", "G", "B"]
-    assert render.notes == ["alpha: A holds integers; the render counts as one without alpha"]
+    assert not render.notes
 
 
 def test_a_beauty_of_the_wrong_channel_count_is_not_said_to_be_missing(tmp_path):
@@ -40,7 +42,7 @@ def test_a_beauty_of_the_wrong_channel_count_is_not_said_to_be_missing(tmp_path)
 
 def test_integers_are_said_of_the_file_that_holds_them(tmp_path):
     ids = {f"ids.{c}": np.full((H, W), 4000, np.uint32) for c in "RGB"}
-    with pytest.raises(InputError, match=r"other\.exr: albedo: ids\.R, ids\.G, ids\.B hold integers"):
+    with pytest.raises(InputError, match=r"albedo: layer 'other\.exr: ids' has channels R, G, B of integers"):
         beside(tmp_path, ids, ["albedo={}:ids"])
 
 

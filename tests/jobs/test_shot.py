@@ -223,7 +223,7 @@ SORTS = {
     "ids for a beauty": (
         lambda lr, hr: write_exr(hr, rgb(np.ones((HEIGHT, WIDTH, 3), np.uint32))),
         "failed",
-        "hold integers",
+        "no layer with R, G, B",
     ),
     "missing LRHS": (lambda lr, hr: lr.unlink(), "missing", "no LRHS"),
     "missing HRLS": (lambda lr, hr: hr.unlink(), "missing", "no HRLS"),

@@ -28,21 +28,29 @@ class FileContents:
 
     source: ExrFile
     """The HRLS."""
-    beauty: tuple[Channel, ...]
-    """Channels R, G, B and perhaps A of the HRLS, which the fused pixels replace; no alpha of another part."""
-    dropped: frozenset[Channel]
-    """Channels of the HRLS that are left out."""
-    rgb: Array
-    """The fused beauty, scene linear, (height, width, 3)."""
-    alpha: Array | None
-    """Its alpha, (height, width, 1), if ``beauty`` has an A."""
-    extra: Mapping[str, NDArray[Any]]
-    """Further layers, those of :data:`oiio_msspl.exr.write_options.COMPONENTS`, (height, width, channels) each."""
-    attributes: dict[str, str]
-    """Header attributes that are added to the part of the beauty."""
+    fused: tuple[Channel, ...]
+    """Channels R, G, B and perhaps A of the HRLS, which the fused pixels replace."""
     options: WriteOptions
+    rgb: Array = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
+    """The fused beauty, scene linear, (height, width, 3), over its data window."""
+    alpha: Array | None = None
+    """Its alpha, (height, width, 1), if ``fused`` has an A."""
+    extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Further layers, those of :data:`oiio_msspl.exr.write_options.COMPONENTS`, (height, width, channels) each."""
+    attributes: dict[str, str] = field(default_factory=dict)
+    """Header attributes that are added to the part of the beauty."""
     replaced: ReplacedChannels = field(default_factory=ReplacedChannels)
     """New pixels for channels that are passed on, over the data window of their part."""
+
+    @cached_property
+    def beauty(self) -> tuple[Channel, ...]:
+        """The channels of the fused part: ``fused`` without an alpha of another part."""
+        return without_alpha_apart(self.fused)
+
+    @cached_property
+    def dropped(self) -> frozenset[Channel]:
+        """Channels of the HRLS that are left out."""
+        return dropped_channels(self.source, self.fused, self.options.layers)
 
     @property
     def home(self) -> Part:

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,43 +17,28 @@ from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import replacing
-from oiio_msspl.exr.contents import FileContents, dropped_channels, without_alpha_apart
+from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.part_specs import beauty_spec, extra_spec, passed_on_parts, share_attributes
 from oiio_msspl.exr.reader import Channel, ExrFile, open_exr, reason_of
 from oiio_msspl.exr.render import Window
-from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import channel_names, write_single_part
 from oiio_msspl.exr.strips import LARGEST_STRIP, ROWS_PER_STRIP, strip_rows
 from oiio_msspl.exr.write_options import ADDED, WriteOptions
 from oiio_msspl.findings import Finding
-from oiio_msspl.image.arrays import Array, unload
+from oiio_msspl.image.arrays import unload
 from oiio_msspl.image.parallel import one_ahead
 
 
 def write_fused(
     path: Path,
-    source: ExrFile,
-    beauty: Sequence[Channel],
-    rgb: Array,
-    alpha: Array | None,
-    attributes: dict[str, str],
-    options: WriteOptions,
+    contents: FileContents,
     *,
-    extra: Mapping[str, NDArray[Any]] = MappingProxyType({}),
-    replaced: ReplacedChannels | None = None,
     overwrite: bool = False,
     before_rename: Callable[[], object] | None = None,
 ) -> list[Finding]:
     """Write the fused frame to ``path``, atomically.
 
-    Args:
-        source: the HRLS, whose layers are passed on.
-        beauty: channels R, G, B and perhaps A of the HRLS, which the fused frame replaces.
-        rgb: scene linear, (height, width, 3), over the beauty's data window.
-        alpha: (height, width, 1) if ``beauty`` has an A, otherwise None.
-        attributes, replaced: see :class:`FileContents`.
-        extra: further layers, such as ``error``, see :attr:`FileContents.extra`.
-        overwrite, before_rename: see :func:`oiio_msspl.exr.atomic.replacing`.
+    ``overwrite`` and ``before_rename`` are those of :func:`oiio_msspl.exr.atomic.replacing`.
 
     Returns:
         Warnings, one sentence each.
@@ -62,24 +47,23 @@ def write_fused(
         InputError: the layout can't hold these parts, a layer can't be read, or ``path`` exists.
         MssplError: the file can't be written; a file at ``path`` is untouched.
     """
-    dropped = dropped_channels(source, beauty, options.layers)
+    parts, last = contents.source.parts, contents.fused[-1]
     warnings = [
         Finding("deep", f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on")
-        for part in source.parts
+        for part in parts
         if part.deep
     ]
-    colour, replaced = without_alpha_apart(beauty), replaced or ReplacedChannels()
-    if len(colour) < len(beauty) and alpha is not None:
-        if source.parts[beauty[-1].part].data_window == source.parts[beauty[0].part].data_window:
-            replaced.add(beauty[-1:], alpha.shape[1], alpha.shape[0])
-            replaced.put(beauty[-1], 0, alpha[..., 0])
+    if last not in contents.beauty and contents.alpha is not None:
+        alpha = contents.alpha[..., 0]
+        if parts[last.part].data_window == contents.home.data_window:
+            contents.replaced.add([last], alpha.shape[1], alpha.shape[0])
+            contents.replaced.put(last, 0, alpha)
         else:
             text = "the alpha has another data window than the beauty, so it is passed on as it is"
             warnings.append(Finding("no_alpha", text))
-        alpha = None
-    contents = FileContents(source, colour, dropped, rgb, alpha, extra, attributes, options, replaced)
+        contents = replace(contents, alpha=None)
     with replacing(path, overwrite=overwrite, before_rename=before_rename) as temporary:
-        if options.layout == "multilayer":
+        if contents.options.layout == "multilayer":
             write_single_part(temporary, contents)
         else:
             _write_parts(temporary, contents)
@@ -87,9 +71,9 @@ def write_fused(
     return warnings
 
 
-def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str]) -> None:
-    """Check by the headers alone that the layout can hold what :func:`write_fused` would write."""
-    contents = _without_pixels(source, beauty, options, extra)
+def check_layout(source: ExrFile, beauty: tuple[Channel, ...], options: WriteOptions, extra: Iterable[str]) -> None:
+    """Check by the headers alone that the layout can hold a fused frame with these ``extra`` layers."""
+    contents = FileContents(source, beauty, options, extra=dict.fromkeys(extra, np.empty(0)))
     kept = {layer.name for channel, layer in contents.layers.items() if channel not in contents.dropped}
     if name := next((name for name in contents.extra if name in kept), None):
         raise InputError(
@@ -100,22 +84,13 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
         channel_names(contents)
 
 
-def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions) -> int:
+def bytes_held(source: ExrFile, beauty: tuple[Channel, ...], options: WriteOptions) -> int:
     """Return the bytes of pixels that :func:`write_fused` holds beside the fused frame, by the headers alone."""
     if options.layout != "multilayer":
         return 0
-    contents = _without_pixels(source, beauty, options)
+    contents = FileContents(source, beauty, options)
     passed_on = (part.plane_bytes(channel) for part, channels in contents.passed_on for channel in channels)
     return sum(passed_on) + sum(contents.home.plane_bytes(channel) for channel in contents.beauty)
-
-
-def _without_pixels(
-    source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str] = ()
-) -> FileContents:
-    """Describe by the headers alone what :func:`write_fused` would write."""
-    nothing = np.empty((0, 0, 3), np.float32)
-    dropped, layers = dropped_channels(source, beauty, options.layers), dict.fromkeys(extra, nothing)
-    return FileContents(source, without_alpha_apart(beauty), dropped, nothing, None, layers, {}, options)
 
 
 def _write_parts(path: Path, contents: FileContents) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import MssplError
-from oiio_msspl.exr.contents import stored_type
+from oiio_msspl.exr.contents import FileContents, stored_type
 from oiio_msspl.exr.preview import old_preview, write_preview
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
@@ -62,19 +62,17 @@ def write_settled(frame: ShotFrame, existing: ExistingResults) -> None:
         report.warnings.append(Finding("clipped", text))
 
     def write(before_rename: Callable[[], object] | None) -> None:
-        report.warnings += write_fused(
-            report.output,
+        contents = FileContents(
             report.hr.file,
             report.hr.beauty_channels,
+            settings.write,
             picture.rgb,
             picture.alpha,
+            _layers_about(picture, settings.write),
             provenance(report),
-            settings.write,
-            extra=_layers_about(picture, settings.write),
-            replaced=picture.replaced,
-            overwrite=overwrite,
-            before_rename=before_rename,
+            picture.replaced or ReplacedChannels(),
         )
+        report.warnings += write_fused(report.output, contents, overwrite=overwrite, before_rename=before_rename)
 
     def preview() -> None:
         if report.preview is None:

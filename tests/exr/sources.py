@@ -5,6 +5,7 @@ import numpy as np
 import OpenEXR
 
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import write_fused
@@ -41,11 +42,12 @@ def written(tmp_path, parts, options=None, **attributes):
     return fused, tmp_path / "out.exr", read_bits(tmp_path / "out.exr")
 
 
-def write_beside(hr, options=None, image=None, alpha=None, attributes=(), **more):
+def write_beside(hr, options=None, image=None, alpha=None, attributes=(), overwrite=False, **more):
     """Write a fused frame, white unless ``image`` is given, as out.exr beside its HRLS; returns what is said of it."""
     image = np.ones((hr.data_window.height, hr.data_window.width, 3), np.float32) if image is None else image
     out, options = hr.file.path.with_name("out.exr"), options or WriteOptions()
-    return write_fused(out, hr.file, hr.beauty_channels, image, alpha, dict(attributes), options, **more)
+    contents = FileContents(hr.file, hr.beauty_channels, options, image, alpha, attributes=dict(attributes), **more)
+    return write_fused(out, contents, overwrite=overwrite)
 
 
 def behind_a_deep_part(path, channels, deep=("A", "Z")):

@@ -302,6 +302,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.writer import write_fused
 limit = int(sys.argv[2])
 if limit:
@@ -314,7 +315,8 @@ rgb = np.random.default_rng(0).random((hr.data_window.height, hr.data_window.wid
 print("writing", flush=True)
 try:
     for _ in range(int(sys.argv[3])):
-        write_fused(folder / "out.exr", hr.file, hr.beauty_channels, rgb, None, {}, WriteOptions(), overwrite=True)
+        contents = FileContents(hr.file, hr.beauty_channels, WriteOptions(), rgb)
+        write_fused(folder / "out.exr", contents, overwrite=True)
 except MssplError as error:
     print(error)
     sys.exit(error.exit_code)

@@ -261,7 +261,7 @@ rgb = np.zeros((window.height, window.width, 3), np.float32)
 options = WriteOptions(sys.argv[3])
 held = writer.bytes_held(hr.file, hr.beauty_channels, options)
 before = peak_mib()
-writer.write_fused(Path(sys.argv[2]), hr.file, hr.beauty_channels, rgb, None, {}, options)
+writer.write_fused(Path(sys.argv[2]), writer.FileContents(hr.file, hr.beauty_channels, options, rgb))
 print(held >> 20, peak_mib() - before)
 """
 

@@ -47,15 +47,10 @@ def connect(scheduler: str) -> Client:
     except ImportError as error:
         raise InputError("--scheduler needs Dask: pip install 'dask[distributed]'") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its tracebacks repeat our messages
-    is_file = Path(scheduler).is_file()
-    if is_file:
-        try:
-            json.loads(Path(scheduler).read_text(encoding="utf-8"))["address"]
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            raise InputError(f"--scheduler {scheduler}: is no scheduler file of Dask; it has no address") from error
+    file = Path(scheduler)
     try:
-        return Client(scheduler_file=scheduler) if is_file else Client(scheduler)
-    except (OSError, ValueError) as error:
+        return Client(json.loads(file.read_text(encoding="utf-8"))["address"] if file.is_file() else scheduler)
+    except (OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error})") from error
 
 

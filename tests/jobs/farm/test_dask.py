@@ -209,7 +209,7 @@ def test_an_address_without_a_scheduler_is_a_mistake(tmp_path):
 def test_a_file_without_a_scheduler_is_a_mistake(tmp_path, text):
     pytest.importorskip("distributed")
     (tmp_path / "scheduler.json").write_text(text)
-    with pytest.raises(InputError, match=r"scheduler\.json: is no scheduler file of Dask"):
+    with pytest.raises(InputError, match=r"scheduler\.json: no Dask scheduler answers there"):
         connect(str(tmp_path / "scheduler.json"))
 
 

@@ -78,12 +78,13 @@ def check_encodable(path: Path) -> None:
         raise InputError(f"{path}: the path is not UTF-8, which OpenImageIO can't open; rename it") from error
 
 
-def check_folder(path: Path) -> None:
+def check_folder(path: Path, *, writable: bool = True) -> None:
     """Raise InputError if the folder of ``path``, or of the file that a link points to, is missing or read-only."""
     folder = Path(os.path.realpath(path)).parent if path.is_symlink() else path.parent
     if not folder.is_dir():
-        raise InputError(f"{path}: the folder {folder} does not exist; create it first")
-    if not os.access(folder, os.W_OK):
+        problem = "is a file; name another one" if folder.exists() else "does not exist; create it first"
+        raise InputError(f"{path}: the folder {folder} {problem}")
+    if writable and not os.access(folder, os.W_OK):
         raise InputError(f"{path}: the folder {folder} is not writable")
 
 

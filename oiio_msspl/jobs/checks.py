@@ -12,7 +12,7 @@ from oiio_msspl.aovs.mapping import split_exr
 from oiio_msspl.aovs.renderers import file_names
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_separate
+from oiio_msspl.exr.atomic import check_folder, check_separate
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import bytes_held
 from oiio_msspl.fusion.fuse import check_model
@@ -43,11 +43,9 @@ def check_mapped_sequences(frames: Sequence[FrameFiles], inputs: InputOptions) -
             )
 
 
-def check_no_file(folder: Path) -> None:
-    """Raise InputError if an output folder, or the one that it is to be made in, is a file."""
-    for path in (folder, folder.parent):
-        if path.exists() and not path.is_dir():
-            raise InputError(f"{path}: is a file, and the results of a shot need a folder; name another output")
+def check_output(shot: Shot, *, writable: bool = True) -> None:
+    """Raise InputError if the output folder is not there and can't be made, or if files can't be written in it."""
+    check_folder(shot.output.path(0) if shot.output.folder.exists() else shot.output.folder, writable=writable)
 
 
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None, *, error: bool = False) -> str:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuses a shot: every frame of two sequences, or of one, in this process or on a Dask cluster.
 
-A bad frame is reported and does not stop the others. An EXR that is replaced comes before its preview, so a run that is
-killed between the two leaves the new frame without a preview.
+A bad frame is reported and does not stop the others.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import InputError, MssplError, explain
-from oiio_msspl.exr.atomic import check_folder, make_folder, remove_leftovers
+from oiio_msspl.exr.atomic import make_folder, remove_leftovers
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
@@ -23,8 +22,8 @@ from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.checks import (
     check_first_pair,
     check_mapped_sequences,
-    check_no_file,
     check_no_input,
+    check_output,
     look_ahead,
     model_of_shot,
 )
@@ -125,9 +124,7 @@ def fuse_shot(
         require_device(device)
     path = None if report_path is None else Path(report_path)
     check_mapped_sequences(shot.frames, inputs)
-    folder = shot.output.folder
-    check_no_file(folder)
-    check_folder(shot.output.path(0) if folder.exists() else folder)
+    check_output(shot)
     check_no_input(shot, inputs, model, [] if path is None else [path])
     with limit_threads(threads):
         plan = plan_temporal(shot, inputs, temporal, model, write)
@@ -135,8 +132,7 @@ def fuse_shot(
     settings = Settings(inputs, write, model, device, threads, memory, view_transform, overwrite, skip, update, strict)
     report = ShotReport(shot, temporal=plan.text, neighbours=plan.count, warnings=plan.warnings)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
-    make_folder(folder)
-    check_folder(shot.output.path(0))
+    make_folder(shot.output.folder)
     running = _RunningReport(report, path, progress, start)
     to_fuse, skipped = running.add_known(ExistingResults(settings, plan), earlier)
     if to_fuse:

@@ -20,8 +20,8 @@ from tests.shots import HEIGHT, WIDTH, layers, make_shot
         (["lr", "hr", "-o", "out", "--device", "abacus"], "--device 'abacus': use one of cpu"),
         (["lr", "hr", "-o", "hr"], "hr/beauty.1001.exr: is one of the inputs"),
         (["lr", "hr", "-o", "no/out"], "no/out: the folder no does not exist"),
-        (["lr", "hr", "-o", "text.onnx/out"], "text.onnx: is a file, and the results of a shot need a folder"),
-        (["lr", "hr", "-o", "text.onnx"], "text.onnx: is a file, and the results of a shot need a folder"),
+        (["lr", "hr", "-o", "text.onnx/out"], "the folder text.onnx is a file; name another one"),
+        (["lr", "hr", "-o", "text.onnx"], "the folder text.onnx is a file; name another one"),
         (["lr", "hr", "-o", "out", "--temporal", "9"], "give auto, off, or a number of frames from 1 to 8"),
         (
             ["lr", "hr", "-o", "out", "--temporal", "2"],

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_encodable, check_folder, replacing
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.atomic import check_encodable, check_folder, make_folder, replacing
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
-from oiio_msspl.jobs.checks import check_no_file, check_no_input, model_of_shot
+from oiio_msspl.jobs.checks import check_no_input, check_output, model_of_shot
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
 from oiio_msspl.jobs.settings import bytes_of
@@ -143,10 +143,7 @@ def make_job(
     if not any(frame.lr and frame.hr for frame in shot.frames):
         raise InputError(f"no frame is in both {shot.lr.pattern} and {shot.hr.pattern}; nothing to submit")
     check_no_input(shot, InputOptions(map_file=map_file), model)
-    check_no_file(shot.output.folder)
-    folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
-    if not folder.is_dir():
-        raise InputError(f"{output}: the folder {folder} does not exist; create it first")
+    check_output(shot, writable=False)
     job = Job(shot, {"parameterDefinitions": []}, {})
     arguments = [
         _add_sequence(job, name, path, path.is_dir(), what, "IN")
@@ -255,12 +252,9 @@ def write_bundle(folder: Path, job: Job) -> None:
         MssplError: the file system refused.
     """
     check_folder(folder)
-    try:
-        folder.mkdir()
-    except FileExistsError as error:
-        raise InputError(f"{folder}: exists; name a new folder for the bundle") from error
-    except OSError as error:
-        raise MssplError(f"{folder}: can't be made ({error.strerror})") from error
+    if folder.exists():
+        raise InputError(f"{folder}: exists; name a new folder for the bundle")
+    make_folder(folder)
     for_deadline = {"parameterValues": [{"name": name, "value": value} for name, value in job.values.items()]}
     try:
         for name, content in ((VALUES, for_deadline), (OPENJD_VALUES, job.values), (TEMPLATE, job.template)):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -40,8 +39,8 @@ ROWS_PER_PUT = 256
 def write_settled(frame: ShotFrame, existing: ExistingResults) -> None:
     """Write the EXR and the preview of a frame that is settled.
 
-    A new EXR gets its name after its preview, so an EXR that exists is a frame that is complete. An EXR that is
-    replaced goes first: if it can't be replaced, the old frame keeps its preview.
+    The EXR gets its name after its preview, so a new EXR is a frame that is complete. A preview of an old frame is
+    replaced or deleted when the new EXR is complete, just before it gets its name.
 
     Args:
         frame: its report gets the time of writing, the number of clipped values, and warnings.
@@ -61,45 +60,41 @@ def write_settled(frame: ShotFrame, existing: ExistingResults) -> None:
         text = f"{report.clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}; --float keeps them"
         report.warnings.append(Finding("clipped", text))
 
-    def write(before_rename: Callable[[], object] | None) -> None:
-        contents = FileContents(
-            report.hr.file,
-            report.hr.beauty_channels,
-            settings.write,
-            picture.rgb,
-            picture.alpha,
-            _layers_about(picture, settings.write),
-            provenance(report),
-            picture.replaced or ReplacedChannels(),
-        )
-        report.warnings += write_fused(report.output, contents, overwrite=overwrite, before_rename=before_rename)
+    replaces = overwrite and any(path is not None and path.exists() for path in (report.output, report.preview))
+    old = old_preview(report.output) if replaces else None
 
     def preview() -> None:
-        if report.preview is None:
-            return
         about = report.hr.data_window, report.hr.display_window, settings.view_transform, report.hr.space
         try:
-            write_preview(report.preview, picture.rgb, *about, overwrite=overwrite_preview)
+            if report.preview is not None:
+                write_preview(report.preview, picture.rgb, *about, overwrite=overwrite_preview)
         except MssplError as error:  # a frame is good without its preview
             report.warnings.append(Finding("no_preview", f"no preview: {error}"))
             report.preview = None
+        if old is not None and old != report.preview:
+            old.unlink(missing_ok=True)
 
-    if overwrite and any(path is not None and path.exists() for path in (report.output, report.preview)):
-        old = old_preview(report.output)  # shows the old frame, and the new preview may fail or may not be wanted
-        write(None if old is None else lambda: old.unlink(missing_ok=True))
-        preview()
-    else:
-        wait = in_background(preview)
-        try:
-            write(wait)
-        except BaseException:
-            if wait is not preview:  # with one thread, it may not have begun
-                with suppress(Exception):
-                    wait()
-            # If another run has put the frame there in the meantime, the preview belongs to that frame.
-            if report.preview is not None and not report.output.exists():
-                report.preview.unlink(missing_ok=True)
-            raise
+    contents = FileContents(
+        report.hr.file,
+        report.hr.beauty_channels,
+        settings.write,
+        picture.rgb,
+        picture.alpha,
+        _layers_about(picture, settings.write),
+        provenance(report),
+        picture.replaced or ReplacedChannels(),
+    )
+    finish_preview = preview if replaces else in_background(preview)
+    try:
+        report.warnings += write_fused(report.output, contents, overwrite=overwrite, before_rename=finish_preview)
+    except BaseException:
+        if finish_preview is not preview:  # otherwise it may not have begun
+            with suppress(Exception):
+                finish_preview()
+        # If the old frame is there, or another run has put one there in the meantime, the preview belongs to it.
+        if report.preview is not None and not report.output.exists():
+            report.preview.unlink(missing_ok=True)
+        raise
     frame.picture = None
     report.seconds["write"] = time.perf_counter() - start
     log.debug("report: %s", report.as_dict())

@@ -70,42 +70,31 @@ def fuse_frames(
     workers = _most_workers_on_a_machine(client)
     address = client.scheduler.address
     run = uuid.uuid4().hex
-    #: The chunks under way, and how often a frame of a chunk may still be tried again.
-    futures: dict[Future, tuple[list[FrameFiles], int]] = {}
+    futures: dict[Future, list[FrameFiles]] = {}
     # skip_existing lets a task that runs again keep its frames, and replace the preview that a dead worker left without
     # its EXR.
     settings = replace(settings, skip_existing=True)
     existing = ExistingResults(settings, plan)
-
-    def submit(chunk: list[FrameFiles], tries: int) -> Future:
-        key = f"msspl-fuse-{chunk[0].number}-{tries}-{run}"
-        future = client.submit(_fuse_chunk, run, settings, plan, chunk, workers, key=key, retries=RETRIES)
-        futures[future] = chunk, tries
-        return future
-
     size = CHUNK if plan.count else 1
     try:
-        ended = as_completed([submit(frames[start : start + size], RETRIES) for start in range(0, len(frames), size)])
-        for future in ended:
-            chunk, tries = futures.pop(future)
-            failure: Exception | None = None
+        for start in range(0, len(frames), size):
+            chunk = frames[start : start + size]
+            key = f"msspl-fuse-{chunk[0].number}-{run}"
+            futures[client.submit(_fuse_chunk, run, settings, plan, chunk, workers, key=key, retries=RETRIES)] = chunk
+        for future in as_completed(list(futures)):
+            chunk = futures.pop(future)
             try:
-                outcomes = dict(zip(chunk, future.result(), strict=True))
-                # Another try may not meet the reason again, unless the files are it.
-                errors = [item for item in outcomes.items() if tries and isinstance(item[1], Exception)]
-                failed = [frame for frame, error in errors if not isinstance(error, InputError)]
-                if failed:
-                    ended.add(submit(failed, tries - 1))
-                yield from (item for item in outcomes.items() if item[0] not in failed)
+                yield from zip(chunk, future.result(), strict=True)
+                continue
             except KilledWorker:
-                failure = MssplError("every worker that tried it died; if for lack of memory, lower --max-memory")
+                text = "every worker that tried it died; if for lack of memory, lower --max-memory"
+                failure: Exception = MssplError(text)
             except (CancelledError, CommClosedError) as error:
                 raise MssplError(f"{address}: the Dask scheduler is gone; run again with --skip-existing") from error
             except Exception as error:
                 failure = error
-            if failure is not None:
-                # Frames of the chunk that were written before are complete.
-                yield from ((frame, None if existing.skips(frame) else failure) for frame in chunk)
+            # Frames of the chunk that were written before are complete.
+            yield from ((frame, None if existing.skips(frame) else failure) for frame in chunk)
     finally:
         client.cancel(list(futures))
 
@@ -142,6 +131,11 @@ def _fuse_chunk(run: str, settings: Settings, plan: ShotPlan, frames: list[Frame
     outcomes: dict[int, Outcome] = {}
     # There was no EXR when the run began (or it may be replaced), so another try or another worker has written it.
     missing = [frame for frame in frames if not existing.skips(frame)]
-    if missing:
-        run_pipeline(ShotRun(settings, plan, missing), lambda frame, outcome: outcomes.update({frame.number: outcome}))
+    for _ in range(1 + RETRIES):
+        if missing:
+            shot = ShotRun(settings, plan, missing)
+            run_pipeline(shot, lambda frame, outcome: outcomes.update({frame.number: outcome}))
+        # Another try may not meet the reason again, unless the files are it.
+        failed = [frame for frame in missing if isinstance(outcomes[frame.number], Exception)]
+        missing = [frame for frame in failed if not isinstance(outcomes[frame.number], InputError)]
     return [outcomes.get(frame.number) for frame in frames]

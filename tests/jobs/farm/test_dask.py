@@ -17,11 +17,10 @@ from oiio_msspl.jobs import pipeline
 from oiio_msspl.jobs.farm import dask as dask_cluster
 from oiio_msspl.jobs.farm.dask import _sessions, connect, fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
-from oiio_msspl.jobs.plan import ShotPlan, TemporalOptions, ViewPlan
+from oiio_msspl.jobs.plan import ShotPlan, TemporalOptions
 from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
-from oiio_msspl.jobs.timeline import Reach
 from tests.jobs.test_over_time import make_shot_with_passes
 from tests.programs import fuse
 from tests.shots import contents, make_shot, write_png
@@ -218,28 +217,22 @@ def test_a_shot_that_is_done_waits_for_no_worker():
     assert list(fuse_frames(None, None, None, [])) == []
 
 
-#: Frames of the tasks that :func:`fail_once` has got.
-TASKS: list[list[int]] = []
-
-
-def fail_once(run, settings, plan, frames, workers):
-    """In place of a task, in this process: the server is away for frame 2, at first."""
-    TASKS.append([frame.number for frame in frames])
-    away = MssplError("the server is away") if len(TASKS) == 1 else {"warnings": []}
-    outcomes = {1: {"warnings": ["a"]}, 2: away, 3: InputError("no file"), 4: None}
-    return [outcomes[frame.number] for frame in frames]
-
-
 def test_only_the_frames_of_a_chunk_that_failed_are_tried_again(monkeypatch):
-    """The others keep their reports, and are not fused again."""
-    distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr(dask_cluster, "_fuse_chunk", fail_once)
+    """The others keep their reports, and are not fused again. The server is away for frame 2, at first."""
+    pytest.importorskip("distributed")
+    tasks = []
+
+    def fail_once(frames, record):
+        tasks.append([frame.number for frame in frames])
+        away = MssplError("the server is away") if len(tasks) == 1 else {"warnings": []}
+        outcomes = {1: {"warnings": ["a"]}, 2: away, 3: InputError("no file"), 4: None}
+        for frame in frames:
+            record(frame, outcomes[frame.number])
+
+    monkeypatch.setattr(dask_cluster, "ShotRun", lambda settings, plan, frames: frames)
+    monkeypatch.setattr(dask_cluster, "run_pipeline", fail_once)
     frames = [FrameFiles(number, Path("lr.exr"), Path("hr.exr"), Path(f"{number}.exr")) for number in (1, 2, 3, 4)]
-    with distributed.Client(
-        processes=False, n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
-    ) as made:
-        plan = ShotPlan(views={None: ViewPlan(Reach(1, 1))})
-        outcomes = {f.number: outcome for f, outcome in fuse_frames(made, Settings(), plan, frames)}
-    assert TASKS == [[1, 2, 3, 4], [2]]
-    assert outcomes[1] == {"warnings": ["a"]} and outcomes[2] == {"warnings": []} and outcomes[4] is None
-    assert isinstance(outcomes[3], InputError)
+    outcomes = dask_cluster._fuse_chunk("run", Settings(), ShotPlan(), frames, 1)
+    assert tasks == [[1, 2, 3, 4], [2]]
+    assert (outcomes[0], outcomes[1], outcomes[3]) == ({"warnings": ["a"]}, {"warnings": []}, None)
+    assert isinstance(outcomes[2], InputError)

@@ -37,14 +37,10 @@ def check_layers(views: Sequence[MappedRender], write: WriteOptions) -> None:
     if write.passes == ("none",) and any(layers.by_user for layers in hr.additive_sets):
         raise InputError("--sum and --passes none exclude each other: fuse the layers of the sum, or leave it out")
     if write.passes and write.passes != ("none",) and not any(sets_to_fuse(view, write) for view in views):
-        if any(layers.matches(p) for view in views for layers in view.additive_sets for p in write.passes):
-            raise InputError(
-                f"--passes {', '.join(write.passes)}: --layers {', '.join(write.layers)} leaves these layers out; "
-                "name them there, too"
-            )
         names = dict.fromkeys(f"'{layers.name}'" for view in views for layers in _written_sets(view, write))
+        what = "such set of layers" + (f" that --layers {', '.join(write.layers)} keeps" if write.layers else "")
         listed = ", ".join(names) or "none"
-        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {listed}")
+        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no {what}; it has {listed}")
 
 
 def _written_sets(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:

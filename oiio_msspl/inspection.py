@@ -71,10 +71,11 @@ class Inspection:
     @property
     def layers(self) -> list[dict[str, str]]:
         """All layers of the file: rows with ``layer``, ``view``, ``channels``, ``type`` and ``part``."""
+        if self.file is None:
+            return []
         rows = []
-        for layer in layers_of(self.file, deep=True) if self.file is not None else ():
+        for layer in layers_of(self.file, deep=True):
             channels = list(layer.channels.values())
-            assert self.file is not None
             parts = dict.fromkeys(self.file.parts[channel.part] for channel in channels)
             rows.append({
                 "layer": layer.name or "(unnamed)",

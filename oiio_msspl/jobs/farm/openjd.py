@@ -202,10 +202,9 @@ def _step(
 def _name_of(shot: Shot) -> str:
     """Name a job after its renders and frames: the last folders say the shot, and file names alone rarely do."""
     pattern = shot.hr.pattern
-    folders = [part for part in pattern.folder.absolute().parts[1:][-3:] if "{{" not in part]
-    base = pattern.base.rstrip("._-")
+    names = [*pattern.folder.absolute().parts[1:][-3:], pattern.base.rstrip("._-")]
     frames = format_frames(sorted(frame.number for frame in shot.frames))
-    return f"msspl-fuse {'/'.join([*folders, base] if '{{' not in base else folders)} {frames}"
+    return f"msspl-fuse {'/'.join(name for name in names if '{{' not in name)} {frames}"
 
 
 def _words_of(command: str) -> list[str]:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputError, InputOptions, fuse_shot, map_render, open_exr
-from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.write_options import WriteOptions
@@ -267,8 +266,8 @@ def test_frames_beside_one_that_failed_for_another_reason_fail_too(tmp_path, bil
     assert contents(folder / "out") == contents(folder / "clean")
 
 
-@pytest.mark.parametrize("place", ["disk", "files"])
-def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bilinear_models, monkeypatch, place):
+@pytest.mark.parametrize("large", ["_vector_bytes", "_pixel_bytes"])
+def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bilinear_models, monkeypatch, large):
     folder = make_moving_shot(tmp_path, count=4)
     fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
     in_memory = contents(folder / "out")
@@ -276,17 +275,11 @@ def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bili
     real = reading._read_pixels
     monkeypatch.setattr(reading, "_read_pixels", lambda frame: pixels.append(real(frame) or frame.renders.hr))
     monkeypatch.setattr("oiio_msspl.image.arrays.MOST_PIXELS", 10)
-    if place == "disk":
-        monkeypatch.setattr(memory, "_vector_bytes", lambda render, channels: 1 << 32)
-    else:
-        monkeypatch.setattr(memory, "_pixel_bytes", lambda render, features: 1 << 40)
+    monkeypatch.setattr(memory, large, lambda render, names: 1 << 32)
     fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]), overwrite=True)
     assert contents(folder / "out") == in_memory
     assert len(pixels) == 4
-    if place == "disk":
-        assert all(isinstance(each.layers["rgb"], np.memmap) for each in pixels)
-    else:
-        assert all(isinstance(each, MappedRender) for each in pixels)
+    assert all(isinstance(each.layers["rgb"], np.memmap) for each in pixels)
 
 
 @pytest.mark.parametrize(

@@ -152,11 +152,6 @@ def all_within(mask: Mask, reach: int) -> Mask:
     return ~max_around(~mask, reach)
 
 
-def grown(mask: Mask, reach: int = 1) -> Mask:
-    """Return a mask (h, w, ...) that is extended by ``reach`` rows and columns on all sides (dilation)."""
-    return max_around(mask, reach)
-
-
 def in_squares(whole: Mask, partly: Mask, side: int, fraction: float) -> Mask:
     """Return the pixels (h, w) that lie in squares of ``side`` x ``side`` pixels that fulfil two conditions.
 
@@ -171,13 +166,11 @@ def in_squares(whole: Mask, partly: Mask, side: int, fraction: float) -> Mask:
     return _window_sums(np.pad(squares.astype(np.int32), side - 1), side) > 0
 
 
-def max_3x3(values: Array) -> Array:
-    """Return the largest of the 3 x 3 values around each pixel, (h, w, ...)."""
-    return max_around(values, 1)
+def max_around(values: NDArray[T], reach: int = 1) -> NDArray[T]:
+    """Return the largest value up to ``reach`` rows and columns away from each pixel, (h, w, ...).
 
-
-def max_around(values: NDArray[T], reach: int) -> NDArray[T]:
-    """Return the largest value up to ``reach`` rows and columns away from each pixel, (h, w, ...)."""
+    That extends a mask by so many pixels on all sides (dilation).
+    """
     for axis in (0, 1):
         distance, left = 1, reach
         while left > 0:  # windows that overlap double their reach with each maximum

@@ -12,7 +12,7 @@ from oiio_msspl.fusion.tiles import tiling
 from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR
 from oiio_msspl.fusion.tiles.guards import SMEAR
 from oiio_msspl.fusion.tiles.network import INVISIBLE
-from oiio_msspl.image.filters import grown
+from oiio_msspl.image.filters import max_around
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture, rgb, write_exr
@@ -485,7 +485,7 @@ def test_alpha_settles_only_where_both_renders_agree(session, scale):
     alpha = fuse(low, high, session).alpha
     under = np.zeros((96, 128, 1), bool)
     under[3 * scale : 4 * scale, 3 * scale : 4 * scale] = True
-    assert (alpha[under] > 0).all() and not alpha[~grown(under, SMEAR)].any()
+    assert (alpha[under] > 0).all() and not alpha[~max_around(under, SMEAR)].any()
 
 
 def test_alpha_without_a_partner_is_passed_through_and_said(session, scale):

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from oiio_msspl.image.filters import all_within, box_downsample, filled, grown, means_around, upsample_linear
+from oiio_msspl.image.filters import all_within, box_downsample, filled, max_around, means_around, upsample_linear
 
 
 @pytest.mark.parametrize("size", [(40, 27), (9, 5), (1, 30)])
@@ -72,7 +72,7 @@ def test_masks_shrink_and_grow_as_far_as_asked(reach):
     mask[20, 25] = True
     y, x = np.ogrid[:40, :50]
     near = (abs(y - 20) <= reach) & (abs(x - 25) <= reach)
-    np.testing.assert_array_equal(grown(mask, reach), near)
+    np.testing.assert_array_equal(max_around(mask, reach), near)
     np.testing.assert_array_equal(all_within(~mask, reach), ~near)
 
 

@@ -12,7 +12,7 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.motion.source import FLOW, STATIC, VECTORS, MotionFrame, MotionSource
 from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.image.arrays import Array, Mask, kept
-from oiio_msspl.image.filters import grown
+from oiio_msspl.image.filters import max_around
 from oiio_msspl.image.sampling import nearest_indices
 
 #: A vector and the way back may differ by this, in HRLS pixels: by rounding, and by what vectors change within a pixel.
@@ -90,7 +90,7 @@ class ShotMotion:
             # Pixels are followed there and back, so one direction tells both. Where the way back leads elsewhere, the
             # surface is only hidden.
             if borders is not None:
-                objects &= ~grown(borders, BESIDE_BORDERS)
+                objects &= ~max_around(borders, BESIDE_BORDERS)
             hidden = objects & ~_leads_back(objects, forth, back, first.hr.data_window, second.hr.data_window)
             objects, known, back_objects = objects & ~hidden, known & ~hidden, None
         elif not same:

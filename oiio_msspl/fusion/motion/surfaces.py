@@ -16,7 +16,7 @@ from oiio_msspl.aovs.features import NORMAL
 from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import Array, Mask, finite, planes_of
-from oiio_msspl.image.filters import grown, means_around, sum_3x3
+from oiio_msspl.image.filters import max_around, means_around, sum_3x3
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices
 
@@ -149,7 +149,7 @@ def _differ(
                 other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
         if other.any():
             other |= means_around(other.astype(np.float32), [AROUND])[0] > MOST
-            other = grown(other)
+            other = max_around(other)
         result[rows] = other[rows.start - around.start :][: rows.stop - rows.start]
 
     for_row_blocks(work, area.height, area.width)

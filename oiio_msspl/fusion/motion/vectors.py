@@ -16,7 +16,7 @@ from oiio_msspl.aovs.motion import MotionFormat
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import Array, Mask
-from oiio_msspl.image.filters import grown
+from oiio_msspl.image.filters import max_around
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices
 
@@ -170,7 +170,7 @@ def near_borders(vectors: Array, tolerance: float) -> Mask:
             differs = ~(np.square(change.real) + np.square(change.imag) < tolerance**2)
             pixels[1:] |= differs
             pixels[:-1] |= differs
-        result[rows] = grown(borders)[rows.start - top : rows.stop - top]
+        result[rows] = max_around(borders)[rows.start - top : rows.stop - top]
 
     for_row_blocks(work, len(result), vectors[:1].size)
     return result

@@ -17,7 +17,7 @@ from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
 from oiio_msspl.fusion.tiles.prepare import FramePair
 from oiio_msspl.image.arrays import Array, Mask, blank, unload
-from oiio_msspl.image.filters import all_within, grown
+from oiio_msspl.image.filters import all_within, max_around
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.model.session import Session
 
@@ -51,7 +51,7 @@ def fuse_alone(
     window, seconds = alignment.hr_data_window, session.seconds
     alone = whole_grid(alignment, lambda core: _alone(counts[core.slices(window)]))[..., 0]
     reach = max(1, SMALLEST // 2 // alignment.scale)
-    places = grown(all_within(alone >= 0.5, reach), reach)
+    places = max_around(all_within(alone >= 0.5, reach), reach)
     if not places.any() or alone.min() == 1:  # a frame that stands alone was fused from its own renders
         return
     with limit_threads(session.threads), pair.hr.cache_strips(cache_bytes):

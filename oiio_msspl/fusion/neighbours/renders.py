@@ -27,7 +27,7 @@ from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import read_lrhs
 from oiio_msspl.image.arrays import Array, Mask, all_finite, repair, unload
 from oiio_msspl.image.colour import luminance
-from oiio_msspl.image.filters import columns_apart, even_and_odd, grown, interpolate, means_around
+from oiio_msspl.image.filters import columns_apart, even_and_odd, interpolate, max_around, means_around
 from oiio_msspl.image.sampling import nearest_indices, sample_cubic
 from oiio_msspl.model.contract import ONE_SIZE
 
@@ -214,7 +214,7 @@ class RenderBand:
         if path.moved_objects is not None:
             counted = counted * self._far_from(path.moved_objects)
         bright = likeness(self._luminance, luminance(lrhs), self._light.darkest, OTHER_BRIGHTNESS, steep=True)
-        counted = counted * np.where(grown(share < 1, 2), BESIDE_HIDDEN * bright, np.float32(1))
+        counted = counted * np.where(max_around(share < 1, 2), BESIDE_HIDDEN * bright, np.float32(1))
         weight = from_grid(alignment, counted, area) * shown
         top = self._rows.start
 

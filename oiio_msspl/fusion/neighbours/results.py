@@ -19,7 +19,7 @@ from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.colour import luminance
-from oiio_msspl.image.filters import grown
+from oiio_msspl.image.filters import max_around
 from oiio_msspl.image.sampling import sample_cubic
 
 #: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.
@@ -61,7 +61,7 @@ class ResultBand:
         if path.hops == 1:
             self._borders = _borders(hop.there, self._window, area)
             if path.moved_objects is not None:
-                self._borders = self._borders | grown(path.moved_objects, 2)
+                self._borders = self._borders | max_around(path.moved_objects, 2)
         warped = _warp(hop.frame, path)
         picture = to_grid(alignment, np.where(path.valid[..., None], warped[RGB], self._own[RGB]), area)
         weight = from_grid(alignment, judge(picture), area) * path.valid

@@ -25,7 +25,7 @@ from oiio_msspl.fusion.neighbours.bands import grid_window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.colour import luminance
-from oiio_msspl.image.filters import grown, halved, max_3x3, means_around, sum_3x3, upsample_linear
+from oiio_msspl.image.filters import halved, max_around, means_around, sum_3x3, upsample_linear
 
 #: Side of the smallest cells that are judged, in HRLS pixels, unless LRHS pixels are larger; and side of those from
 #: which the light of the whole frame is judged, and not of bands of rows.
@@ -163,7 +163,7 @@ class Light(ABC):
         lamps |= least > np.float32(LAMP) * (self._most[rows] + np.float32(self.darkest))
         if lamps.any():
             # Weights are interpolated between LRHS pixels, so those beside a lamp are 0, too.
-            trust[grown(lamps)] = 0
+            trust[max_around(lamps)] = 0
         return trust
 
     def coarse_trust(self, neighbour: Sequence[Array], valid: Mask) -> Array:
@@ -276,7 +276,7 @@ def _bounds(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
     # A firefly is in one render alone. A lamp, however small, is bright in both. Means over many pixels do not notice
     # it, and a thousandth of its light is seen on a dark wall.
     least = np.minimum(*(sum_3x3(render) for render in (lrhs, hrls))) * np.float32(1 / 9)
-    return least, max_3x3(np.maximum(lrhs, hrls))
+    return least, max_around(np.maximum(lrhs, hrls))
 
 
 def likeness(own: Array, other: Array, darkest: float, half: float, *, steep: bool = False) -> Array:

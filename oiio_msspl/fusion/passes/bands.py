@@ -22,7 +22,7 @@ from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
 from oiio_msspl.fusion.tiles.network import FusedPixels
 from oiio_msspl.image.arrays import Array, planes_of
-from oiio_msspl.image.filters import box_downsample, max_3x3
+from oiio_msspl.image.filters import box_downsample, max_around
 
 #: HRLS rows that are fused at a time.
 BAND_ROWS = 128
@@ -132,7 +132,7 @@ class Band:
         images = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
         # LRHS pixels at the edge of a window or of a lamp show a part of it, and its light would leak over the edge.
         self.ranges = {
-            layer: tuple(planes_of(sign * max_3x3(sign * samples)[self._hrls_rows]) for sign in (-1, 1))
+            layer: tuple(planes_of(sign * max_around(sign * samples)[self._hrls_rows]) for sign in (-1, 1))
             for job in jobs
             for layer in job.noise_free.intersection(job.estimated)
             for samples in (features[job.names[layer]],)
@@ -195,7 +195,7 @@ def dimmed(job: PassJob, pixels: Mapping[str, Array], beauty: Array) -> Array:
         rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
         layers = np.concatenate([layers, rest[None]])
     light = layers.sum(axis=(0, 1))
-    allowed = FIREFLY * max_3x3(beauty.sum(axis=0))
+    allowed = FIREFLY * max_around(beauty.sum(axis=0))
     layers *= np.minimum(1, allowed / np.maximum(light, 1e-20))
     return layers
 

@@ -18,7 +18,7 @@ from oiio_msspl.fusion.passes.lines import downsampled
 from oiio_msspl.fusion.passes.plan import PassJob
 from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features, read_lrhs
 from oiio_msspl.image.arrays import Array, Mask
-from oiio_msspl.image.filters import blurred, box_downsample, filled, max_3x3, upsample_linear
+from oiio_msspl.image.filters import blurred, box_downsample, filled, max_around, upsample_linear
 from oiio_msspl.image.parallel import for_row_blocks
 
 #: HRLS pixels on a side of the squares over which the shares of layers are averaged.
@@ -166,6 +166,6 @@ class SharesAround:
         for render in (sources.low, sources.high):
             render.unload()
         # Relative to the beauty, or a bright thing in a square would decide for all of it.
-        layers /= np.maximum(max_3x3(beauty.sum(axis=0)), 1e-20)
+        layers /= np.maximum(max_around(beauty.sum(axis=0)), 1e-20)
         lines = estimated_of(job, layers).sum(axis=(1, 2), dtype=np.float64)
         return np.add.reduceat(lines, range(0, area.width, SQUARE // alignment.scale), axis=1).T

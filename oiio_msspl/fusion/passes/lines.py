@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from oiio_msspl.fusion.tiles.guards import LAYER_REACH
 from oiio_msspl.image.arrays import Array, planes_of
-from oiio_msspl.image.filters import blurred, box_downsample, grown, max_3x3
+from oiio_msspl.image.filters import blurred, box_downsample, max_around
 from oiio_msspl.image.parallel import for_row_blocks, two_at_a_time
 from oiio_msspl.model.contract import ONE_SIZE
 
@@ -193,11 +193,11 @@ class BeautyFit:
         mean, products = means[:3], means[3:]
         slopes = (products - mean * self._means) / self._variances
         # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
-        lowest, highest = (np.stack([sign * max_3x3(sign * plane) for plane in layer]) for sign in (-1, 1))
+        lowest, highest = (np.stack([sign * max_around(sign * plane) for plane in layer]) for sign in (-1, 1))
         if few_samples:
             # Where a rare light has no sample by chance, the mean over pixels that look alike is the bound. This
             # ends two LRHS pixels before LAYER_REACH, because the bounds are interpolated.
-            near_light = grown(np.any(layer != 0, axis=0), self._reach)
+            near_light = max_around(np.any(layer != 0, axis=0), self._reach)
             highest = np.where(near_light & (highest < mean * np.float32(NO_SAMPLE)), mean, highest)
         lines = np.concatenate([slopes, mean - slopes * self._means])
         self._nearby.apply(lines, np.concatenate([lowest, highest]), self._beauty, out)

@@ -18,7 +18,7 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, repair
-from oiio_msspl.image.filters import box_downsample, enlarged, filled, grown, in_squares, interpolate, max_3x3
+from oiio_msspl.image.filters import box_downsample, enlarged, filled, in_squares, interpolate, max_around
 
 Indices = NDArray[np.int64]
 T = TypeVar("T", bound=np.generic)
@@ -94,7 +94,7 @@ def read_tile(
         hrls[RGB] = np.where(lost[..., None], enlarged(low[RGB], scale), hrls[RGB])
     failed = _failed_buckets(low[RGB], hrls[RGB], scale)
     if failed is not None:
-        in_bucket = grown(failed[1]).repeat(scale, axis=0).repeat(scale, axis=1)
+        in_bucket = max_around(failed[1]).repeat(scale, axis=0).repeat(scale, axis=1)
         dead = in_bucket & _is_dead(hrls[RGB])
         hrls[RGB] = np.where(dead[..., None], enlarged(low[RGB], scale), hrls[RGB])
         for name in hrls.keys() - {RGB}:
@@ -152,7 +152,7 @@ def _infinite(rgb: Array) -> Mask:
 
 def _as_bright(rgb: Array) -> Mask:
     """Return where the 3 x 3 pixels of one render (h, w, 3) confirm an infinite pixel of the other as a lamp."""
-    return max_3x3(rgb).max(axis=-1) >= HALF_MAX / FIREFLY_FACTOR
+    return max_around(rgb).max(axis=-1) >= HALF_MAX / FIREFLY_FACTOR
 
 
 def read_lrhs(

@@ -14,7 +14,7 @@ from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TileFeatures
 from oiio_msspl.image.arrays import FLOAT_MAX, Array, Mask, planes_of
-from oiio_msspl.image.filters import all_within, box_downsample, grown, max_3x3, means_around, neighbours
+from oiio_msspl.image.filters import all_within, box_downsample, max_around, means_around, neighbours
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
 
@@ -135,10 +135,10 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
         excesses = [np.maximum(mean - clipped, 0) for mean in (lrhs_rgb, box_downsample(hrls_rgb, scale))]
         light, hrls_light, covered = (reduce(np.add, neighbours(values)) for values in (*excesses, coverage))
         even = least + light / np.maximum(covered, np.float32(1 / scale**2))
-        limit = np.maximum(max_3x3(lrhs_rgb), even)
+        limit = np.maximum(max_around(lrhs_rgb), even)
         factor = np.nan_to_num(np.minimum(light / np.maximum(hrls_light, np.float32(1e-30)), 1))
         blocks = _by_lrhs_pixel(hrls_rgb, scale)
-        factor[(max_3x3(blocks.max(axis=(1, 3))) - least) * covered > 2 * hrls_light] = 0
+        factor[(max_around(blocks.max(axis=(1, 3))) - least) * covered > 2 * hrls_light] = 0
         # The LRHS pixel must have light, too. Otherwise the HRLS pixel is a firefly beside a lamp.
         most = lrhs_rgb * np.float32(FIREFLY_FACTOR)
     factor, limit, most = map(_over_hrls, (factor, limit, most))
@@ -169,12 +169,12 @@ def steady_lights(rgb: Array, exposure: float) -> Array | None:
         alike = reduce(np.logical_and, ((np.abs(pixels - own) <= limit).all(axis=1) for pixels in around))
     steady = np.zeros(brightest.shape, dtype=bool)
     steady[rows, columns] = alike
-    return rgb * grown(steady)[..., None] if alike.any() else None
+    return rgb * max_around(steady)[..., None] if alike.any() else None
 
 
 def _brightness_limit(rgb: Array, tile: TileFeatures) -> Array:
     """Return the largest values that the other render may have, (h, w, 3): infinity where this render is black."""
-    brightest = max_3x3(rgb)
+    brightest = max_around(rgb)
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
         limit = brightest * np.float32(FIREFLY_FACTOR)
         # All 3 x 3 pixels around may have missed light that few samples find. One of s x s samples of it may be s^2
@@ -242,7 +242,7 @@ class EmptyRegions:
         self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
         self._has_rare_light = np.zeros_like(self._black)
         if of_pass and self._black.any():
-            self._has_rare_light = grown(_rare_light(_brightest(lrhs_rgb), 0, 0) > 0, _SQUARE)
+            self._has_rare_light = max_around(_rare_light(_brightest(lrhs_rgb), 0, 0) > 0, _SQUARE)
 
     def mask(self, tile: TileFeatures, window: tuple[slice, slice]) -> Mask | None:
         """Return the empty HRLS pixels of a tile, (s*h, s*w, 1); None if no LRHS pixel is black.

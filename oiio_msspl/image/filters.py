@@ -225,28 +225,22 @@ def _window_sums(values: NDArray[Any], size: int) -> NDArray[Any]:
     return values
 
 
-def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
-    """Return the mean of the pixels up to ``reach`` rows and columns away, one plane (h, w) for each reach.
-
-    Pixels beyond the edge do not count.
-    """
-    (height, width), most = plane.shape, max(reaches)
-    results = [np.empty((height, width), np.float32) for _ in reaches]
+def means_around(plane: Array, reach: int) -> Array:
+    """Return the mean of the pixels up to ``reach`` rows and columns away (h, w); none lie beyond the edge."""
+    height, width = plane.shape
+    result = np.empty((height, width), np.float32)
 
     def work(rows: slice) -> None:
-        top, bottom = max(rows.start - most, 0), min(rows.stop + most, height)
-        first = top - rows.start + most
-        padded = np.zeros((rows.stop - rows.start + 2 * most, width + 2 * most), np.float32)
-        padded[first : first + bottom - top, most : most + width] = plane[top:bottom]
-        for reach, result in zip(reaches, results, strict=True):
-            rest = most - reach
-            sums = _window_sums(padded[rest : len(padded) - rest, rest : width + 2 * most - rest], 2 * reach + 1)
-            lines, columns = (
-                (np.minimum(places + reach + 1, size) - np.maximum(places - reach, 0)).astype(np.float32)
-                for places, size in ((np.arange(rows.start, rows.stop), height), (np.arange(width), width))
-            )
-            counts = lines[:, None] * columns if lines.min() < lines.max() else lines[0] * columns
-            np.divide(sums, counts, out=result[rows])
+        top, bottom = max(rows.start - reach, 0), min(rows.stop + reach, height)
+        first = top - rows.start + reach
+        padded = np.zeros((rows.stop - rows.start + 2 * reach, width + 2 * reach), np.float32)
+        padded[first : first + bottom - top, reach : reach + width] = plane[top:bottom]
+        lines, columns = (
+            (np.minimum(places + reach + 1, size) - np.maximum(places - reach, 0)).astype(np.float32)
+            for places, size in ((np.arange(rows.start, rows.stop), height), (np.arange(width), width))
+        )
+        counts = lines[:, None] * columns if lines.min() < lines.max() else lines[0] * columns
+        np.divide(_window_sums(padded, 2 * reach + 1), counts, out=result[rows])
 
     for_row_blocks(work, height, 2 * width)
-    return results
+    return result

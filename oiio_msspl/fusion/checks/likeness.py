@@ -109,7 +109,7 @@ def fits_better(before: list[Fit], after: list[Fit], *, certain: bool) -> bool:
 def fine_structure(values: Array) -> Array:
     """Return differences (h, w) to the neighbourhood, in units of its RMS, so that no bright corner dominates."""
     fine = values - blurred(values, 4)
-    (power,) = means_around(np.square(fine), [4])
+    power = means_around(np.square(fine), 4)
     return fine / np.sqrt(power + np.float32(1e-3 * float(np.mean(np.square(fine))) + 1e-20))
 
 

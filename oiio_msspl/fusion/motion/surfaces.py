@@ -148,7 +148,7 @@ def _differ(
             if differs.any():
                 other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
         if other.any():
-            other |= means_around(other.astype(np.float32), [AROUND])[0] > MOST
+            other |= means_around(other.astype(np.float32), AROUND) > MOST
             other = max_around(other)
         result[rows] = other[rows.start - around.start :][: rows.stop - rows.start]
 

@@ -266,7 +266,7 @@ class RenderBand:
     def _far_from(self, moved_objects: Mask) -> Array:
         """Return how much a neighbour counts around objects that are not followed: 0 to 1, (h, w) over the grid."""
         share = to_grid(self._alignment, moved_objects.astype(np.float32), self._area)
-        (near,) = means_around(share, [max(1, round(NEAR_OBJECTS / self._alignment.scale))])
+        near = means_around(share, max(1, round(NEAR_OBJECTS / self._alignment.scale)))
         return np.maximum(1 - near / np.float32(FEW), 0)
 
     def _fetch_low(self, neighbour: RenderPair, path: Path, valid: Mask, share: Array) -> tuple[Features, Mask]:

@@ -243,8 +243,9 @@ class _Cells:
         height, width = self.noise.shape
         trust = np.ones_like(self.noise) if coarse is None else coarse[:height, :width]
         own_error = self.noise * np.float32(min(self.share, 1)) + np.float32(EQUAL)
-        means = means_around((self.low * self.high).mean(axis=-1), REACHES)
-        for reach, mean in zip(REACHES, means, strict=True):
+        products = (self.low * self.high).mean(axis=-1)
+        for reach in REACHES:
+            mean = means_around(products, reach)
             one = self.deviation / np.float32(2 * reach + 1)
             least, most = (
                 1 / (1 + np.square(np.square(np.maximum(change, 0) / (np.float32(TOLERATED) * own_error))))
@@ -264,7 +265,7 @@ def cells(image: Array, scale: int, side: int) -> Array:
 def _noise(lrhs: Array, hrls: Array, brightness: Array) -> Array:
     """Return the variance (h, w) of the mean of both renders (h, w, c), relative to the brightness."""
     squares = np.square(_limited((lrhs - hrls) / (2 * brightness))).mean(axis=-1)
-    return means_around(squares, [NOISE_REACH])[0]
+    return means_around(squares, NOISE_REACH)
 
 
 def _limited(differences: Array) -> Array:

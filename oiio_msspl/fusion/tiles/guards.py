@@ -79,7 +79,7 @@ def with_pure_colours(fused: Array, rgb: Array, mixed: Array, exposure: float) -
         places = (np.flatnonzero(differs.any(axis=axis)) for axis in (1, 0))
         box = tuple(slice(max(used[0] - PURE_REACH, 0), used[-1] + PURE_REACH + 1) for used in places)
         weight = bright[box] / changed[box].max()  # sums of the largest floats would overflow
-        own, light = (means_around(image[box] * weight, [PURE_REACH])[0] for image in (pure, changed))
+        own, light = (means_around(image[box] * weight, PURE_REACH) for image in (pure, changed))
         added = 1 - np.divide(own, light, out=np.ones_like(own), where=light > 0)
         # Pixels at the edge have light of what is beside them. Networks change the small channel, and mix it there.
         added = np.maximum(added, np.minimum(2 * added - PURE, 1))

@@ -148,8 +148,8 @@ def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple
         larger = _trust_in_windows([halved(plane) for plane in values], levels - 1, 4 * cells)
         coarser, noise_around = (_enlarge(plane, height, width) for plane in larger)
     else:
-        coarser, noise_around = np.zeros_like(values[0]), means_around(values[-1], [WINDOW])[0]
-    means = two_at_a_time(lambda plane: means_around(plane, [WINDOW])[0], values[:-1])
+        coarser, noise_around = np.zeros_like(values[0]), means_around(values[-1], WINDOW)
+    means = two_at_a_time(lambda plane: means_around(plane, WINDOW), values[:-1])
     energy, noise, common, change, lit, squares, squares_of_both, darker = means
     # Windows that lack rare light lack its noise, too, and both renders agree that they are dark. So a darker one has
     # the noise of all around, and also needs brighter pixels on which the renders agree.
@@ -160,7 +160,7 @@ def _trust_in_windows(values: list[Array], levels: int, cells: int = 1) -> tuple
         _certainty(energy - noise, squares, count) * _kept(energy, noise),
         _certainty(least, squares_of_both, count) * _kept(change, change - common),
     )
-    return np.maximum(coarser, means_around(part, [WINDOW])[0]), noise_around
+    return np.maximum(coarser, means_around(part, WINDOW)), noise_around
 
 
 def _trust_in_points(
@@ -177,7 +177,7 @@ def _trust_in_points(
     least = change if scale > 1 else np.maximum(change, np.float32(LARGEST))
     common = np.clip(common, -least, brighter)
     weight = 1 / np.maximum(change / np.float32(LARGEST), 1)
-    agreed, total = (means_around(weight * values, [size])[0] for values in (common, brighter))
+    agreed, total = (means_around(weight * values, size) for values in (common, brighter))
     share = agreed / (total + np.float32(DOUBT / (2 * size + 1) ** 2))
     scattered = np.clip((share - AGREED[0]) / (AGREED[1] - AGREED[0]), 0, 1)
     alone = _kept(light, np.float32(ALONE) * max_around(noise, size))
@@ -233,15 +233,16 @@ def _agreed(low: Array, high: Array, share: np.float32, levels: int) -> Array:
         low, high = low - _enlarge(half_low, height, width), high - _enlarge(half_high, height, width)
     mean = high + share * (low - high)
     most = np.float32(LARGEST)
-    near, product = [LIGHT_REACH], low * high
+    product = low * high
     # Over four times the reach, in cells of twice the size.
-    squares_around = _enlarge(means_around(halved(np.square(product)), [2 * LIGHT_REACH])[0], height, width)
+    squares_around = _enlarge(means_around(halved(np.square(product)), 2 * LIGHT_REACH), height, width)
     product = np.clip(product, -most, most)
-    common, squares, energy = (means_around(plane, near)[0] for plane in (product, product * product, mean * mean))
+    planes = product, product * product, mean * mean
+    common, squares, energy = (means_around(plane, LIGHT_REACH) for plane in planes)
     # Most windows lack rare light.
     squares = np.where(mean < 0, np.maximum(squares, squares_around), squares)
     shrink = _certainty(common, squares, (2 * LIGHT_REACH + 1) ** 2) * _kept(energy, energy - common)
-    return mean * means_around(shrink, near)[0] + coarser
+    return mean * means_around(shrink, LIGHT_REACH) + coarser
 
 
 def _enlarge(half: Array, height: int, width: int) -> Array:

@@ -125,11 +125,6 @@ def map_rows(function: Callable[[Array], object], source: Array) -> Array:
     return result
 
 
-def clip(values: Array, lowest: float, highest: float) -> Array:
-    """Clip values to a range, as ``np.clip``, on all cores."""
-    return map_rows(lambda block: np.clip(block, lowest, highest, out=block), values)
-
-
 def all_finite(values: Array) -> bool:
     """Return whether no value is NaN or infinite; perhaps False where the sum overflows."""
     with np.errstate(over="ignore", invalid="ignore"):

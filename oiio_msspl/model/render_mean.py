@@ -7,12 +7,12 @@ less noise than either render. This module finds the weights, and the models com
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.image.arrays import Array, clip
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance
 
@@ -21,6 +21,8 @@ Images = dict[str, Array]
 #: Weight of the LRHS in the mean of both renders, in [0, 1], by feature; 0 for features that are absent.
 Shares = dict[str, float]
 
+#: The range of each feature in which the models average it.
+_RANGES = {RGB: (0.0, np.inf), ALBEDO: (0.0, 1.0), NORMAL: (-1.0, 1.0)}
 #: Bounds of the LRHS's share, because an estimate of 0 or 1 may be wrong.
 _BOUNDS = (0.05, 0.95)
 #: An albedo or normal of the LRHS does not show the same as that of the HRLS if their mean squared difference exceeds
@@ -44,21 +46,15 @@ def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float, share: 
     """
     scale = len(pairs[0][1][RGB]) // len(pairs[0][0][RGB])
 
-    def low(name: str) -> Array:
-        return np.stack([_comparable(name, lrhs[name]) for lrhs, _ in pairs])
-
-    def high(name: str) -> Array:
-        return np.stack([box_downsample(_comparable(name, hrls[name]), scale) for _, hrls in pairs])
+    def of_both(name: str) -> Iterator[Array]:
+        for render, factor in ((0, 1), (1, scale)):
+            images = (np.clip(pair[render][name], *_RANGES[name]) for pair in pairs)
+            yield np.stack([box_downsample(image, factor) for image in images])
 
     if share is None:
-        share = lrhs_share(*(encode_radiance(images, exposure) for images in (low(RGB), high(RGB))))
-    shared = set(pairs[0][0]) & set(pairs[0][1])
-    return {RGB: share} | {name: share for name in (ALBEDO, NORMAL) if name in shared and _agree(low(name), high(name))}
-
-
-def _comparable(name: str, image: Array) -> Array:
-    """Clip a feature to the range in which the models average it."""
-    return image if name == RGB else clip(image, 0.0 if name == ALBEDO else -1.0, 1.0)
+        share = lrhs_share(*(encode_radiance(images, exposure) for images in of_both(RGB)))
+    shared = pairs[0][0].keys() & pairs[0][1].keys()
+    return {RGB: share} | {name: share for name in (ALBEDO, NORMAL) if name in shared and _agree(*of_both(name))}
 
 
 def lrhs_share(lrhs: Array, hrls: Array) -> float:

@@ -12,7 +12,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.compare import upsample_bicubic
 from oiio_msspl.fusion.tiles.features import read_features
-from oiio_msspl.image.arrays import Array, clip, repair
+from oiio_msspl.image.arrays import Array, repair
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
@@ -65,7 +65,7 @@ def oidn_on_average(lrhs: ReadableRender, hrls: ReadableRender) -> Array:
         for render in (lrhs, hrls)
     )
     for layers in (low, high):
-        layers |= {name: clip(layers[name], -1.0, 1.0) for name in (ALBEDO, NORMAL) if name in layers}
+        layers |= {name: layers[name].clip(-1.0, 1.0) for name in (ALBEDO, NORMAL) if name in layers}
     scale = len(high[RGB]) // len(low[RGB])
     shares = find_shares([(low if scale == 2 else {RGB: low[RGB]}, high)], find_exposure(low[RGB]))
     means = {name: box_downsample(image, scale) for name, image in high.items()}

@@ -19,7 +19,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.findings import Finding, as_data
-from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
+from oiio_msspl.fusion.checks.noise import is_noise_spread
 from oiio_msspl.fusion.motion.source import MotionSource, find_motion
 from oiio_msspl.fusion.passes.sums import check_sum
 from oiio_msspl.fusion.tiles.alignment import align

@@ -10,8 +10,8 @@ from typing import Any
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.findings import Finding, as_data, codes_of
+from oiio_msspl.fusion.checks.noise import is_noise_spread
 from oiio_msspl.fusion.checks.pair import BOTH_BLACK, check_renders
-from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.jobs.advice import advise
 from oiio_msspl.jobs.inputs import InputOptions, both_paths, find_views, map_pair

@@ -11,8 +11,13 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender, ReadableRender
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.checks.noise_level import CLEAN_AOVS, CLEAN_AOVS_OF_PAIR, has_clean_aovs, has_little_noise
-from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
+from oiio_msspl.fusion.checks.noise import (
+    CLEAN_AOVS,
+    CLEAN_AOVS_OF_PAIR,
+    has_clean_aovs,
+    has_little_noise,
+    is_noise_spread,
+)
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY

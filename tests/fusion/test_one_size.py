@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputError, Render, fuse, fuse_arrays
+from oiio_msspl.fusion.checks.noise import is_noise_spread
 from oiio_msspl.fusion.checks.pair import check_renders
-from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.filters import box_downsample, columns_apart, even_and_odd
 from oiio_msspl.model.catalogue import load_model

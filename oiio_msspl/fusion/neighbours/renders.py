@@ -17,8 +17,7 @@ from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RADIANCE_FEATURES
 from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.checks.averages import BRIGHTEST
-from oiio_msspl.fusion.checks.noise_level import has_clean_aovs
-from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
+from oiio_msspl.fusion.checks.noise import has_clean_aovs, is_noise_spread
 from oiio_msspl.fusion.neighbours.bands import from_grid, grid_window, to_grid, whole_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
 from oiio_msspl.fusion.neighbours.trust import WHOLE, Judge, Light, cells, likeness

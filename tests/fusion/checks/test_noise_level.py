@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl.exr.render import Render
-from oiio_msspl.fusion.checks.noise_level import has_clean_aovs, has_little_noise
+from oiio_msspl.fusion.checks.noise import has_clean_aovs, has_little_noise
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.jobs.settings import family_for_noise

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl import Render
-from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
+from oiio_msspl.fusion.checks.noise import is_noise_spread
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.filters import box_downsample
 from tests.conftest import noisy, picture, spread

@@ -25,7 +25,7 @@ from oiio_msspl.fusion.tiles.guards import (
 )
 from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile, alpha_as_colour
 from oiio_msspl.fusion.tiles.tiling import Tile
-from oiio_msspl.fusion.tiles.trust import halves_of, trust_renders
+from oiio_msspl.fusion.tiles.trust import trust_renders
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
 from oiio_msspl.image.filters import all_within, box_downsample, enlarged
 from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
@@ -176,7 +176,8 @@ def _trusted(tile: PreparedTile, fused: Array, result: FusedPixels, shares: Shar
     lrhs, hrls, share = tile.lrhs[RGB], tile.hrls[RGB], shares.get(RGB, 0.5)
     borrowed, scale = tile.features.borrowed, tile.features.scale
     if tile.variance is not None:
-        lrhs, hrls = halves_of(hrls, tile.variance)
+        deviation = np.sqrt(tile.variance)  # two renders of half of the samples would differ by twice that on average
+        lrhs, hrls = hrls + deviation, hrls - deviation
     if borrowed is not None:
         lrhs = np.where(borrowed[..., None], box_downsample(fused, scale), lrhs)
     picture, trust = trust_renders(

@@ -50,19 +50,6 @@ LIGHT_REACH, LARGEST_FACTOR, CELL = 3, 2.0, 4
 LAMP = 1.0
 
 
-def halves_of(render: Array, variance: Array) -> tuple[Array, Array]:
-    """Return two pictures whose mean is a render, and which differ by twice the standard deviation of each pixel.
-
-    So would two renders of half of its samples, on average.
-
-    Args:
-        render: (h, w, 3), scene linear, >= 0.
-        variance: of the pixels' means, (h, w, 3).
-    """
-    deviation = np.sqrt(variance)
-    return render + deviation, render - deviation
-
-
 def trust_renders(
     fused: Array, lrhs: Array, hrls: Array, *, share: float, exposure: float, reach: int, correct_light: bool = True
 ) -> tuple[Array, Array]:

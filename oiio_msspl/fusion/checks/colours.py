@@ -50,8 +50,7 @@ def different_colours(low: Colours, high: Colours) -> str | None:
 
     ``low``, ``high``: RGB of the same blocks of both renders, (n, 3).
     """
-    finite = np.isfinite(low + high).all(axis=1)  # sums of radiance near the limit of float32 are not
-    low, high = low.T[:, finite], high.T[:, finite]  # each channel is contiguous
+    low, high = np.ascontiguousarray(low.T), np.ascontiguousarray(high.T)
     lights = low.sum(axis=0), high.sum(axis=0)
     lit = np.minimum(*lights) > 0
     if lit.any():

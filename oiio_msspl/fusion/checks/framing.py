@@ -56,10 +56,8 @@ class Framing:
 
 
 def find_framing(low: Array, high: Array) -> Framing:
-    """Find the framing of the HRLS against the LRHS, both luminance (h, w)."""
+    """Find the framing of the HRLS against the LRHS, both luminance (h, w), finite."""
     low, high = tone_mapped(central_area(low), central_area(high))
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        return Framing()  # radiance near the limit of float32
     before = fine_fits(low, high)
     if (how := mirrored(before)) is not None:
         return Framing(mirrored=how, judged=True)

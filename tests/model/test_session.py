@@ -99,7 +99,7 @@ def test_a_contract_survives_its_json():
         ({"lrhs": ["albedo"]}, "the field lrhs of its contract has a value that can't be"),
         ({"transforms": {"curve": "linear"}}, "made for transforms"),
         ({"defaults": {"albedo": 0.4}}, "made for defaults"),
-        ({"scale": 3}, "scale 3 is none of"),
+        ({"scale": 3}, "the field scale of its contract has a value that can't be"),
         ({"surprise": 1}, "can't be read"),
     ],
 )

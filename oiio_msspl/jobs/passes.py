@@ -80,7 +80,7 @@ class Progress:
 def costs_of(views: Sequence[MappedRender], session: Session, write: WriteOptions) -> list[float]:
     """Return what the parts of a frame's work cost: tiles and passes of each view, and then writing."""
     of_tiles, costs = measured().get(session.name, {}).get("time_vnni", 1.0), []
-    of_layer = FITTED_LAYER if session.layers is None else NETWORK_LAYER
+    of_layer = NETWORK_LAYER if session.layers else FITTED_LAYER
     for hr in views:
         megapixels = hr.data_window.width * hr.data_window.height / 1e6
         costs.append(megapixels * of_tiles)

@@ -109,6 +109,5 @@ def load_model(scale: int, name: str | None = None, device: str = "cpu", threads
     Raises:
         InputError: there is no such model, or it can't run on this device.
     """
-    path, layers, half_layers = [*model_files(scale, name), None, None][:3]
-    assert path is not None
-    return Session(path, device, threads, layers=layers, half_layers=half_layers)
+    path, *layers = model_files(scale, name)
+    return Session(path, device, threads, layers=layers)

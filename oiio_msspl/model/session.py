@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import time
 from collections.abc import Sequence
@@ -36,23 +35,15 @@ class Session:
             is one.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
         threads: CPU threads of ONNX Runtime and NumPy alike; 0 for one a core.
-        layers: ONNX file of the model that fuses passes; None if no network does.
-        half_layers: ONNX file of the model that fuses passes at half of the frame's resolution, for half of the scale.
+        layers: ONNX files of the models that fuse passes: one for the scale, and perhaps one for half of it, at half of
+            the frame's resolution; none if no network does.
 
     Raises:
         InputError: the file is no model or has no contract, this onnxruntime was not built for the device, the device
             cannot start, or convolutions would stay on the CPU though the device has operators for them.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        device: str = "cpu",
-        threads: int = 0,
-        *,
-        layers: Path | None = None,
-        half_layers: Path | None = None,
-    ) -> None:
+    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0, *, layers: Sequence[Path] = ()) -> None:
         require_device(device)
         file = file_for(Path(path), device)
         check_threads(threads)
@@ -71,9 +62,9 @@ class Session:
                 f"{path}: has the inputs {', '.join(inputs)[:99]} and the outputs {', '.join(self._outputs)[:99]}, not "
                 f"{', '.join(self.contract.inputs)} and fused; export it again"
             )
-        self.path, self.layers, self.half_layers = Path(path), layers, half_layers
-        self.device, self.threads = device, threads
-        self.weights = digests([path for path in (self.path, layers, half_layers) if path], device)
+        self.path, self.layers, self.device, self.threads = Path(path), layers, device, threads
+        self._layer_sessions: dict[Path, Session] = {}
+        self.weights = digests([self.path, *layers], device)
         """The digests of this model and of those that fuse passes, by name, of the files that are loaded now."""
         self.seconds = 0.0
         """Time spent in :meth:`run` so far."""
@@ -112,21 +103,17 @@ class Session:
         if not self.clean_aovs:
             raise InputError(f"--data-passes: {self.name} does not denoise albedo and normal; use --quality best")
 
-    @functools.cached_property
-    def layer_session(self) -> Session | None:
-        """The model that fuses passes; None if no network does. It is loaded when it is first needed."""
-        return Session(self.layers, self.device, self.threads) if self.layers else None
-
-    @functools.cached_property
-    def half_layer_session(self) -> Session | None:
-        """The model that fuses passes at half of the frame's resolution; None if no network does."""
-        return Session(self.half_layers, self.device, self.threads) if self.half_layers else None
+    def layer_session(self, *, half: bool = False) -> Session:
+        """Return the model that fuses passes, or does at half of the resolution. It is loaded when first needed."""
+        path = self.layers[1 if half else 0]
+        if path not in self._layer_sessions:
+            self._layer_sessions[path] = Session(path, self.device, self.threads)
+        return self._layer_sessions[path]
 
     def release_layer_memory(self) -> None:
         """Call :meth:`release_memory` of the models that fuse passes, if they were loaded."""
-        for name in ("layer_session", "half_layer_session"):
-            if (session := vars(self).get(name)) is not None:
-                session.release_memory()
+        for session in self._layer_sessions.values():
+            session.release_memory()
 
     def run(
         self,

@@ -69,7 +69,7 @@ def fuse_passes(
     Raises:
         InputError: pixels can't be decoded.
     """
-    low, high = _read_light(inputs, by_network=session is not None and session.layers is not None)
+    low, high = _read_light(inputs, by_network=session is not None and len(session.layers) > 0)
     jobs, refused, warnings = plan_passes(low, high, inputs.sets)
     sources = _sources_of(inputs, low, high)
     in_order = sorted(jobs, key=lambda job: inputs.sets.index(job.layers))

@@ -225,9 +225,7 @@ def fuse_layers(
         The fused passes, (height, width, 3) over the HRLS's data window, finite and >= 0: in temporary files if they
         have many pixels.
     """
-    whole = alignment.scale == beauty.alignment.scale
-    layer_session = session.layer_session if whole else session.half_layer_session
-    assert layer_session is not None
+    layer_session = session.layer_session(half=alignment.scale != beauty.alignment.scale)
     # Networks tell light from noise by its brightness, so the exposure is that of the beauty.
     of_pass = (beauty.exposure, max(LAYER_REACH // beauty.alignment.scale - 1, 1))
     size = alignment.hr_data_window.height, alignment.hr_data_window.width

@@ -229,9 +229,8 @@ def test_many_light_groups_are_fused_at_half_of_the_resolution_at_x2(tmp_path, s
         found = {each.name: pixels_of(result, i) for i, each in enumerate(result.jobs[0].layers.layers)}
         assert_sum([each.astype(np.float64) for each in found.values()], beauty.rgb.astype(np.float64))
         errors.append(np.mean([np.abs(found[name] - clean[name]).mean() for name in clean]))
-    at_full_size, at_half_size = (vars(session).get(name) for name in ("layer_session", "half_layer_session"))
-    half = scale == 2 and count == 6
-    assert (at_full_size is None) == half and (at_half_size is None) == (not half)
+    (used,) = session._layer_sessions
+    assert used == session.layers[1 if scale == 2 and count == 6 else 0]
     assert errors[1] < errors[0]
 
 
@@ -302,7 +301,7 @@ def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_
     pair = [map_render(open_exr(file)) for file in pair]
     session = load_model(4, "best", threads=1)
     beauty = fuse(*pair, session)
-    layers = session.layer_session
+    layers = session.layer_session()
     monkeypatch.setattr(layers, "contract", replace(layers.contract, overlap=0))
     run, sizes, found = layers.run, [], []
     monkeypatch.setattr(

@@ -20,7 +20,7 @@ from oiio_msspl.fusion.checks.averages import HrlsAverages, bounded_luminance
 from oiio_msspl.fusion.checks.pair import Judgement, check_pair
 from oiio_msspl.fusion.passes.fuse import FusedPasses
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.network import FusedPixels, TileTask, fuse_tiles, tile_tasks
+from oiio_msspl.fusion.tiles.network import FusedPixels, fuse_tiles, tile_tasks
 from oiio_msspl.fusion.tiles.prepare import FramePair
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, memory_to_fuse, require_memory, strips_memory
 from oiio_msspl.image.arrays import Array, blank, unload
@@ -119,18 +119,14 @@ def fuse(
                 return Judgement()
             return check_pair(bounded_luminance(pair.lrhs_rgb), averages, lr.name, hr.name)
 
-        judged = judge
-
-        def tasks() -> Iterator[TileTask]:
-            nonlocal judged
-            for task in tile_tasks(pair, frame):
-                if task.count == 1:  # all is read, so the pair is judged while the network works
-                    judged = in_background(judge)
-                yield task
-
+        judged, tiles = judge, pair.tiles()
+        frame.tiles = len(tiles)
         with hr.cache_strips(strips_memory(max_memory, held)):
-            for task in fuse_tiles(tasks(), session):
-                frame.tiles = task.count
+            tasks = tile_tasks(pair, frame, tiles=tiles)
+            if len(tiles) == 1:  # it is read now, so the pair is judged while the network works
+                tasks = iter([*tasks])  # lets go of the tile, as a generator does
+                judged = in_background(judge)
+            for task in fuse_tiles(tasks, session):
                 for image in frame.clean_aovs.values():
                     unload(image)
                 for render in (lr, hr):

@@ -95,12 +95,11 @@ def model_files(scale: int, name: str | None = None) -> list[Path]:
     another one fuses passes at half of the frame's resolution.
     """
     path = find_model(scale, name)
-    fast_endings = {"": "", SPREAD: SPREAD, CLEAN: "", SPREAD + CLEAN: SPREAD}
-    endings = {WEIGHTS / f"{QUALITIES['best']}{ending}-x{scale}.onnx": fast for ending, fast in fast_endings.items()}
-    if path not in endings:
+    if path.parent != WEIGHTS or not path.stem.startswith(QUALITIES["best"]):
         return [path]
-    half = [WEIGHTS / f"{MEAN_MODEL}{endings[path]}-x1.onnx"] if scale == 2 else []
-    return [path, find_model(scale, QUALITIES["fast"] + endings[path]), *half]
+    spread = SPREAD if SPREAD in path.stem else ""
+    half = [WEIGHTS / f"{MEAN_MODEL}{spread}-x1.onnx"] if scale == 2 else []
+    return [path, find_model(scale, QUALITIES["fast"] + spread), *half]
 
 
 def load_model(scale: int, name: str | None = None, device: str = "cpu", threads: int = 0) -> Session:

@@ -74,10 +74,6 @@ class _Own(NamedTuple):
     other: Array
     """What neighbours are compared with, see :meth:`Light._compared`."""
 
-    def part(self, rows: slice) -> _Own:
-        """Return some rows of the cells."""
-        return _Own(*(plane[rows] for plane in self))
-
     def halved(self) -> _Own:
         """Return cells of twice the size."""
         own = _Own(*map(halved, self))
@@ -151,7 +147,7 @@ class Light(ABC):
         """Return how much one neighbour counts (h, w), over some rows of the grid."""
         height, width = neighbour[0].shape[:2]
         factor = self._cell // self.alignment.scale
-        own = self._own.part(slice(rows.start // factor, -(-rows.stop // factor)))
+        own = _Own(*(plane[rows.start // factor : -(-rows.stop // factor)] for plane in self._own))
         compared = self._compare([self._cells(image) for image in neighbour], own, self._cell**2 / PIXELS_AVERAGED)
         first = rows.start * self.alignment.scale // WHOLE
         trust = compared.trust(WHOLE // self._cell - 1, coarse[first:])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 
@@ -163,11 +163,11 @@ def _fuse_set(
     job: PassJob, band: Band, network: LayersByNetwork, shares: SharesAround, earlier: Mapping[AdditiveLayer, Array]
 ) -> dict[AdditiveLayer, Array]:
     """Return the light of each layer of a set, (3, h, w) over the core of a band, given that of earlier sets."""
-    lights = {layer: _sum(earlier[part] for part in parts) for layer, parts in job.derived.items()}
+    lights = {layer: reduce(np.add, (earlier[part] for part in parts)) for layer, parts in job.derived.items()}
     if job.estimated:
         rest = band.beauty
         if lights:
-            rest = rest - _sum(lights.values())
+            rest = rest - reduce(np.add, lights.values())
             rest[rest < ROUNDING * band.beauty] = 0
         renders = band.renders_of(job)
         doubts = doubts_of(job, band, *renders) if job.lrhs else None
@@ -177,7 +177,7 @@ def _fuse_set(
             _fit_to_beauty(band, job, renders, layers, [i for i in range(len(layers)) if i not in fused])
         make_exact(layers, rest, job, band, shares, doubts)
         lights |= dict(zip(job.estimated, layers, strict=False))
-    return lights | {layer: _sum(lights[part] for part in parts) for layer, parts in job.coarser.items()}
+    return lights | {layer: reduce(np.add, (lights[part] for part in parts)) for layer, parts in job.coarser.items()}
 
 
 def _fit_to_beauty(band: Band, job: PassJob, renders: Sequence[Array], out: Array, missing: Sequence[int]) -> None:
@@ -200,10 +200,6 @@ def _likeness(band: Band, layers: Array) -> Array:
     lights = (layers.sum(axis=(0, 1), dtype=np.float64), band.low_beauty.sum(axis=0, dtype=np.float64))
     rendered, fused = (np.log(light + 3 * band.sources.dark) for light in lights)
     return np.exp(-np.square((rendered - fused) / LIGHT_SPREAD)).astype(np.float32)
-
-
-def _sum(lights: Iterable[Array]) -> Array:
-    return reduce(np.add, lights)
 
 
 def _store(lights: Mapping[AdditiveLayer, Array], band: Band, window: Window, pixels: ReplacedChannels) -> int:

@@ -40,7 +40,7 @@ def sample_cubic(
     images: Sequence[Array],
     positions: Callable[[slice], tuple[Array, Array]],
     size: tuple[int, int],
-    valid: Mask | None = None,
+    valid: Mask,
 ) -> list[Array]:
     """Sample images by Keys' cubic, within the range of the four nearest pixels. The edge pixel is repeated outside.
 
@@ -48,7 +48,7 @@ def sample_cubic(
         images: (h, w, c) each, of one size.
         positions: takes rows of the result, and returns x and y (n, width of the result) in pixels of the images.
         size: height and width of the result.
-        valid: (height, width), where the result is needed; everywhere if None.
+        valid: (height, width), where the result is needed.
 
     Returns:
         (*size, c) each, with channels that are contiguous in memory.
@@ -74,9 +74,7 @@ def sample_cubic(
         # The pixel above and to the left of the four nearest pixels.
         first = (top.astype(np.intp) + 1) * stride + left.astype(np.intp) + 1
         right, down = x - left, y - top
-        between = (right != 0) | (down != 0)
-        if valid is not None:
-            between &= valid[rows]
+        between = valid[rows] & ((right != 0) | (down != 0))
         chosen: NDArray[np.intp] | None = None
         if np.count_nonzero(between) < MOST_CHOSEN * between.size:
             chosen, pixel = np.flatnonzero(between), first + (stride + 1)

@@ -10,9 +10,9 @@ from oiio_msspl.image.sampling import nearest_indices, sample_cubic
 HEIGHT, WIDTH = 40, 60
 
 
-def sample(monkeypatch, most_chosen, images, x, y, valid=None):
+def sample(monkeypatch, most_chosen, images, x, y, valid=True):
     monkeypatch.setattr(sampling, "MOST_CHOSEN", most_chosen)
-    return sample_cubic(images, lambda rows: (x[rows], y[rows]), x.shape, valid)
+    return sample_cubic(images, lambda rows: (x[rows], y[rows]), x.shape, np.broadcast_to(valid, x.shape))
 
 
 @pytest.mark.parametrize("moving", [0, 0.1, 0.5, 1])

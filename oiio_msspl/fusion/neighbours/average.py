@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -78,9 +79,7 @@ def average_renders(
     if pair.is_one_render and not of_colours and VARIANCE in (features or ()):
         high[SQUARES] = blank((window.height, window.width, 3))
 
-    def band(core: Window, area: Window) -> RenderBand:
-        return RenderBand(pair, light, low, high, core, area)
-
+    band = partial(RenderBand, pair, light, low, high)
     weight = _weight(sum(image.shape[-1] for image in high.values()))
     frames = _average(light, before, after, band, lambda pair: pair.cells, weight)
     if SQUARES in high:
@@ -106,11 +105,7 @@ def average_results(
     renders = frame.lrhs_luminance[..., None], frame.hrls_luminance[..., None]
     light = ResultLight(alignment, *renders, _picture(frame))
     images: Images = {name: blank(image.shape, on_disk=False) for name, image in images_of(frame, window).items()}
-
-    def band(core: Window, area: Window) -> ResultBand:
-        return ResultBand(frame, light, images, core, area)
-
-    frames = _average(light, before, after, band, _cells)
+    frames = _average(light, before, after, partial(ResultBand, frame, light, images), _cells)
     if frame.frames is not None:
         # Averages of averages. If all weights are equal, this is the exact number within 7 percent.
         frames = np.sqrt(np.square(frames) + np.square(frame.frames) - 1)

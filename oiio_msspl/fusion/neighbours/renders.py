@@ -280,9 +280,8 @@ class RenderBand:
         pixels = _with_finite_passes(read(neighbour.lr, place, self._low_names))
         x, y = x - place.x0, y - place.y0
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
-        moves = (
-            path.nearest is not None and self._alignment.scale > ONE_SIZE
-        )  # a render of full size has noise to remove
+        # A render of full size has noise to remove.
+        moves = path.nearest is not None and self._alignment.scale > ONE_SIZE
         smooth = [name for name in pixels if moves and (name in light or is_light_of_pass(name))]
         features = {}
         if smooth:

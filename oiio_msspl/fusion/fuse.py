@@ -58,11 +58,6 @@ class FusedFrame(FusedPixels):
     seconds: float = 0.0
     """Time in the network."""
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of colour, alpha (whether there is one or not) and, if asked for, error."""
-        return self.rgb.nbytes + self.rgb.size // 3 * (4 if self.error is None else 8)
-
 
 def fuse(
     lr: ReadableRender,

@@ -35,7 +35,7 @@ from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes
 from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import is_large
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.tiling import require_memory, strips_memory
+from oiio_msspl.fusion.tiles.tiling import require_memory, result_bytes, strips_memory
 from oiio_msspl.image.arrays import HALF_MAX, kept
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.existing import ExistingResults
@@ -269,12 +269,13 @@ class ShotRun:
         if stored_type(frame.hr.beauty_channels, frame.write) == "half" and beauty.rgb.dtype != np.float16:
             # The passes sum to the beauty that is written.
             beauty = replace(picture, rgb=np.minimum(picture.rgb, np.float32(HALF_MAX)).astype(np.float16))
+        held = frame.held_bytes + result_bytes(picture.alignment, error=picture.error is not None)
         with limit_threads(session.threads):
             picture.passes = fuse_passes(
                 PassInputs(frame.lr, frame.hr, beauty, sets, frame.means, renders),
                 picture.replaced,
                 session=session,
-                cache_bytes=strips_memory(self.settings.max_memory - frame.held_bytes, picture.nbytes),
+                cache_bytes=strips_memory(self.settings.max_memory, held),
                 progress=self._progress,
             )
         picture.replaced = picture.passes.pixels

@@ -3,8 +3,6 @@
 
 Some renderers add each sample to all pixels that the filter reaches. The noise of neighbouring pixels is then alike,
 and denoisers that learnt from independent pixels take it for detail. Renders with little noise have other models, too.
-
-Small samples all over the frame are read.
 """
 
 from __future__ import annotations

@@ -52,9 +52,7 @@ def different_colours(low: Colours, high: Colours) -> str | None:
     """
     low, high = np.ascontiguousarray(low.T), np.ascontiguousarray(high.T)
     lights = low.sum(axis=0), high.sum(axis=0)
-    lit = np.minimum(*lights) > 0
-    if lit.any():
-        lit &= sum(lights) > 0.05 * np.median(sum(lights))
+    lit = (np.minimum(*lights) > 0) & (sum(lights) > 0.05 * np.median(sum(lights)))
     if np.count_nonzero(lit) < MIN_BLOCKS:
         return None
     low, high = low[:, lit], high[:, lit]

@@ -137,6 +137,7 @@ def _differs(pictures: tuple[Array, Array], t: int, other: int, vectors: Array) 
     """Return where a frame of the reference differs from another one that is brought to its place."""
     height, width = vectors.shape[:2]
     y, x = np.mgrid[0:height, 0:width] + np.moveaxis(vectors, -1, 0)[::-1]
-    warped = sample_cubic([half[other] for half in pictures], lambda rows: (x[rows], y[rows]), (height, width))
+    images, everywhere = [half[other] for half in pictures], np.ones((height, width), bool)
+    warped = sample_cubic(images, lambda rows: (x[rows], y[rows]), (height, width), everywhere)
     first, second = (half[t] - moved for half, moved in zip(pictures, warped, strict=True))
     return np.asarray(blurred((first * second).mean(axis=-1), BLURS) > CHANGED**2)

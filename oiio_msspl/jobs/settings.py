@@ -15,6 +15,7 @@ from oiio_msspl.fusion.checks.noise import (
     CLEAN_AOVS,
     CLEAN_AOVS_OF_PAIR,
     has_clean_aovs,
+    has_less_spread_noise,
     has_little_noise,
     is_noise_spread,
 )
@@ -138,12 +139,13 @@ def family_for_noise(
     """Return the counterpart of a family that suits the noise of a pair, and the kind of noise.
 
     It is a key of ``NOISE``; "" for noise that needs no counterpart, and None without noise. Noise that the pixel
-    filter has spread needs weights of its own. Where there is little noise, a denoiser of the HRLS at full size is more
-    accurate, which the LRHS only corrects; it predicts no ``error``. If noise is not spread, it needs a clean albedo
-    and normal, except that of ``best`` for renders of one size, which denoises them before.
+    filter has spread needs weights of its own, unless there is less of it in renders of one size. Where there is little
+    noise, a denoiser of the HRLS at full size is more accurate, which the LRHS only corrects; it predicts no ``error``.
+    If noise is not spread, it needs a clean albedo and normal, except that of ``best`` for renders of one size, which
+    denoises them before.
     """
     spread, scale = is_noise_spread(lr, hr, alignment), alignment.scale
-    kind = SPREAD if spread else ""
+    kind = SPREAD if spread and not has_less_spread_noise(lr, hr, alignment) else ""
     clean = None if error else for_little_noise(family + kind, scale)
     denoises_aovs = family == QUALITIES["best"]
     if clean and has_little_noise(lr, hr, alignment, spread=bool(spread), denoises_aovs=denoises_aovs):

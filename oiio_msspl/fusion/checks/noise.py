@@ -52,8 +52,9 @@ LITTLE_WITH_CLEAN_AOVS = 0.12
 LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
 #: The limit for pairs of two sizes and a model that denoises albedo and normal before: for the noise of their mean.
 LITTLE_OF_MEAN = 0.075
-#: The limit for noise that a filter has spread is this number times the scale.
-LITTLE_SPREAD = 0.009
+#: The limits for noise that a filter has spread, by scale. In renders of one size, models for independent noise keep
+#: more detail below ``LESS_SPREAD``, and those for little noise below the limit of scale 1: at some 300 and 1,000 spp.
+LITTLE_SPREAD, LESS_SPREAD = {1: 0.0055, 2: 0.018, 4: 0.036, 8: 0.072}, 0.009
 #: Blocks of an AOV show edges or texture from this variance on. There, neighbouring pixels of clean AOVs correlate by
 #: more than the second number, in the mean: at 1, 2, 4, 8 and 16 spp by some 0.27, 0.37, 0.44, 0.47 and 0.50.
 EDGES, CLEAN_AOVS = 1e-4, 0.46
@@ -100,29 +101,31 @@ def has_little_noise(
             HRLS, too, if the LRHS has much less.
     """
     scale = alignment.scale
-    if spread or scale == ONE_SIZE:
-        of_one_size = LITTLE_WITH_CLEAN_AOVS if denoises_aovs else LITTLE
-        limit, found = (LITTLE_SPREAD * scale if spread else of_one_size), _noise_in_blocks(lr, hr, alignment)
-    else:
-        limit = LITTLE_OF_MEAN if denoises_aovs else LITTLE_OF_PAIR[scale]
-        found = _noise_by_difference(lr, hr, alignment, of_mean=denoises_aovs)
-    return len(found) > 0 and bool(np.quantile(found, SMOOTH) < limit)
+    if spread:
+        return _noise_in_blocks(lr, hr, alignment) < LITTLE_SPREAD[scale]
+    if scale == ONE_SIZE:
+        return _noise_in_blocks(lr, hr, alignment) < (LITTLE_WITH_CLEAN_AOVS if denoises_aovs else LITTLE)
+    limit = LITTLE_OF_MEAN if denoises_aovs else LITTLE_OF_PAIR[scale]
+    return _noise_by_difference(lr, hr, alignment, of_mean=denoises_aovs) < limit
 
 
-def _noise_in_blocks(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> NDArray[np.float64]:
-    """Return the deviation (n) of the pixels of blocks from a smooth course. Fine texture counts, too."""
+def has_less_spread_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool:
+    """Return whether renders of one size have so little spread noise that models for independent noise gain."""
+    return alignment.scale == ONE_SIZE and _noise_in_blocks(lr, hr, alignment) < LESS_SPREAD
+
+
+def _noise_in_blocks(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> float:
+    """Return the deviation of pixels from a smooth course in smooth blocks. Fine texture counts, too."""
     deviations = []
     for low, high, _ in _samples_of(lr, hr, alignment):
         mean = (high + low) / np.float32(2) if alignment.scale == ONE_SIZE and lr is not hr else high
         image = encode_radiance(luminance(mean)[..., None], find_exposure(mean))[..., 0]
         deviations.append(_noise_in(_blocks_of(image)).std(axis=(1, 2)))
-    return np.concatenate(deviations)
+    return _of_smooth_blocks(np.concatenate(deviations))
 
 
-def _noise_by_difference(
-    lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, of_mean: bool
-) -> NDArray[np.float64]:
-    """Return the deviation (n) of an HRLS pixel's noise in blocks, by the difference of both renders."""
+def _noise_by_difference(lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, of_mean: bool) -> float:
+    """Return the deviation of an HRLS pixel's noise in smooth blocks, by the difference of both renders."""
     lows, highs = [], []
     for low, high, exposure in _samples_of(lr, hr, alignment):
         lows.append(encode_radiance(low, exposure))
@@ -134,7 +137,12 @@ def _noise_by_difference(
     # All colours count alike: blue noise is hardly seen in luminance.
     squares = [np.square(low - high, dtype=np.float64).mean(axis=-1) for low, high in zip(lows, highs, strict=True)]
     deviations = gain * np.sqrt(np.concatenate([_blocks_of(plane) for plane in squares]).mean(axis=1))
-    return deviations[deviations > 0]  # where both are black there is no noise
+    return _of_smooth_blocks(deviations[deviations > 0])  # where both are black there is no noise
+
+
+def _of_smooth_blocks(deviations: NDArray[np.float64]) -> float:
+    """Return the deviation in blocks (n) without texture; infinite without blocks."""
+    return float(np.quantile(deviations, SMOOTH)) if len(deviations) else np.inf
 
 
 def has_clean_aovs(hr: ReadableRender, alignment: Alignment, least: float = CLEAN_AOVS) -> bool:

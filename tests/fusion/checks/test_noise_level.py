@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from oiio_msspl.exr.render import Render
-from oiio_msspl.fusion.checks.noise import has_clean_aovs, has_little_noise
+from oiio_msspl.fusion.checks.noise import has_clean_aovs, has_little_noise, is_noise_spread
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.jobs.settings import family_for_noise
+from tests.conftest import spread
 
 SIZE = 96
 
@@ -82,3 +83,14 @@ def test_fine_texture_of_a_pair_is_no_noise(scale, noise, little):
     )
     assert has_little_noise(lr, hr, align(lr, hr)) is little
     assert not has_little_noise(hr, hr, align(hr, hr))
+
+
+@pytest.mark.parametrize(("light", "ending"), [(0.2, "-spread"), (0.06, ""), (0.02, "-clean")])
+@pytest.mark.parametrize("family", ["joint", "joint-large"])
+def test_models_for_spread_noise_are_not_taken_for_one_render_with_less_of_it(family, light, ending):
+    """They would take detail for noise."""
+    noise = np.random.default_rng(2).normal(1, light, (SIZE, SIZE, 1))
+    hr = Render.from_arrays(rgb=spread(np.repeat(noise, 3, axis=-1).astype(np.float32), 0.6))
+    alignment = align(hr, hr)
+    assert is_noise_spread(hr, hr, alignment)
+    assert family_for_noise(family, hr, hr, alignment) == (family + ending, ending)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each view and view layer of a shot is averaged with its own neighbours."""
 
+import threading
 import time
 import weakref
 from dataclasses import replace
@@ -243,7 +244,8 @@ def test_a_damaged_view_is_absent_wherever_renders_wait(tmp_path, bilinear_model
 
 
 def test_no_more_frames_are_held_than_are_counted(shot, bilinear_models, monkeypatch):
-    held, most = [], []
+    """Neither by the frames that wait nor by the one that is written meanwhile."""
+    held, most, counting = [], [], threading.Event()
     real_read, real_write = reading._read_pixels, pipeline.write_settled
 
     def load(frame):
@@ -251,15 +253,19 @@ def test_no_more_frames_are_held_than_are_counted(shot, bilinear_models, monkeyp
         if frame.view is None:
             held.append(weakref.ref(frame.renders.hr.layers["rgb"]))
             limit = 2 * frame.plan.reach.renders + 2
-            for _ in range(20):  # a thread that has done its work may hold its arguments a moment longer
+            counting.set()
+            for _ in range(500):  # a thread that has done its work may hold its arguments a moment longer
                 alive = sum(pixels() is not None for pixels in held)
                 if alive <= limit:
                     break
                 time.sleep(0.01)
+            counting.clear()
             most.append((alive, limit))
 
     def write(*args):
-        time.sleep(0.3)  # longer than any frame is waited for
+        counting.wait(0.3)
+        while counting.is_set():
+            time.sleep(0.01)
         real_write(*args)
 
     monkeypatch.setattr(reading, "_read_pixels", load)

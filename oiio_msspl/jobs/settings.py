@@ -145,7 +145,8 @@ def family_for_noise(
     denoises them before.
     """
     spread, scale = is_noise_spread(lr, hr, alignment), alignment.scale
-    kind = SPREAD if spread and not has_less_spread_noise(lr, hr, alignment) else ""
+    less = spread and scale == ONE_SIZE and has_less_spread_noise(lr, hr, alignment)
+    kind = SPREAD if spread and not less else ""
     clean = None if error else for_little_noise(family + kind, scale)
     denoises_aovs = family == QUALITIES["best"]
     if clean and has_little_noise(lr, hr, alignment, spread=bool(spread), denoises_aovs=denoises_aovs):

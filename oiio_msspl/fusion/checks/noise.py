@@ -52,9 +52,13 @@ LITTLE_WITH_CLEAN_AOVS = 0.12
 LITTLE_OF_PAIR = {2: 0.065, 4: 0.075, 8: 0.085}
 #: The limit for pairs of two sizes and a model that denoises albedo and normal before: for the noise of their mean.
 LITTLE_OF_MEAN = 0.075
-#: The limits for noise that a filter has spread, by scale. In renders of one size, models for independent noise keep
-#: more detail below ``LESS_SPREAD``, and those for little noise below the limit of scale 1: at some 300 and 1,000 spp.
-LITTLE_SPREAD, LESS_SPREAD = {1: 0.0055, 2: 0.018, 4: 0.036, 8: 0.072}, 0.009
+#: The limits for noise that a filter has spread, by scale: of its deviation, and of the correlation of pixels two
+#: apart, which is higher where texture outweighs noise. Renders of one size reach these at some 500 to 1,000 spp.
+LITTLE_SPREAD = {1: (0.0055, 0.075), 2: (0.018, 0.03), 4: (0.036, 0.03), 8: (0.072, 0.03)}
+#: The limits from which on renders of one size gain by models for independent noise: at some 100 to 300 spp.
+LESS_SPREAD = 0.009, 0.03
+#: Pixels three apart correlate by less than this in noise of filters that are so wide that those two apart do not tell.
+WIDE = -0.2
 #: Blocks of an AOV show edges or texture from this variance on. There, neighbouring pixels of clean AOVs correlate by
 #: more than the second number, in the mean: at 1, 2, 4, 8 and 16 spp by some 0.27, 0.37, 0.44, 0.47 and 0.50.
 EDGES, CLEAN_AOVS = 1e-4, 0.46
@@ -102,30 +106,49 @@ def has_little_noise(
     """
     scale = alignment.scale
     if spread:
-        return _noise_in_blocks(lr, hr, alignment) < LITTLE_SPREAD[scale]
+        return has_less_spread_noise(lr, hr, alignment, LITTLE_SPREAD[scale])
     if scale == ONE_SIZE:
-        return _noise_in_blocks(lr, hr, alignment) < (LITTLE_WITH_CLEAN_AOVS if denoises_aovs else LITTLE)
-    limit = LITTLE_OF_MEAN if denoises_aovs else LITTLE_OF_PAIR[scale]
-    return _noise_by_difference(lr, hr, alignment, of_mean=denoises_aovs) < limit
+        limit = LITTLE_WITH_CLEAN_AOVS if denoises_aovs else LITTLE
+        found = _residuals(lr, hr, alignment).std(axis=(1, 2))
+    else:
+        limit = LITTLE_OF_MEAN if denoises_aovs else LITTLE_OF_PAIR[scale]
+        found = _noise_by_difference(lr, hr, alignment, of_mean=denoises_aovs)
+    return _in_smooth_blocks(found) < limit
 
 
-def has_less_spread_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool:
-    """Return whether renders of one size have so little spread noise that models for independent noise gain."""
-    return alignment.scale == ONE_SIZE and _noise_in_blocks(lr, hr, alignment) < LESS_SPREAD
+def has_less_spread_noise(
+    lr: ReadableRender, hr: ReadableRender, alignment: Alignment, limits: tuple[float, float] = LESS_SPREAD
+) -> bool:
+    """Return whether there is so little spread noise that models for it, trained on more, take detail for noise.
+
+    ``limits``: of the noise's deviation, and of the correlation of pixels two apart. These do not correlate in noise
+    that a filter has spread, and do in texture.
+    """
+    residuals = _residuals(lr, hr, alignment)
+    two_apart, three_apart = (np.median(_correlations_in(residuals, apart)) for apart in (2, 3))
+    is_textured = two_apart > limits[1] and three_apart > WIDE
+    return bool(is_textured or _in_smooth_blocks(residuals.std(axis=(1, 2))) < limits[0])
 
 
-def _noise_in_blocks(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> float:
-    """Return the deviation of pixels from a smooth course in smooth blocks. Fine texture counts, too."""
-    deviations = []
+def _residuals(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> NDArray[np.float64]:
+    """Return the pixels of an HRLS, or of the mean of renders of one size, log-encoded: blocks of :func:`_noise_in`."""
+    residuals = []
     for low, high, _ in _samples_of(lr, hr, alignment):
         mean = (high + low) / np.float32(2) if alignment.scale == ONE_SIZE and lr is not hr else high
         image = encode_radiance(luminance(mean)[..., None], find_exposure(mean))[..., 0]
-        deviations.append(_noise_in(_blocks_of(image)).std(axis=(1, 2)))
-    return _of_smooth_blocks(np.concatenate(deviations))
+        residuals.append(_noise_in(_blocks_of(image)))
+    return np.concatenate(residuals)
 
 
-def _noise_by_difference(lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, of_mean: bool) -> float:
-    """Return the deviation of an HRLS pixel's noise in smooth blocks, by the difference of both renders."""
+def _in_smooth_blocks(deviations: NDArray[np.float64]) -> float:
+    """Return the deviation in blocks (n) with little texture; infinite without blocks. Fine texture counts, too."""
+    return float(np.quantile(deviations, SMOOTH)) if len(deviations) else np.inf
+
+
+def _noise_by_difference(
+    lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, of_mean: bool
+) -> NDArray[np.float64]:
+    """Return the deviation (n) of an HRLS pixel's noise in blocks, by the difference of both renders."""
     lows, highs = [], []
     for low, high, exposure in _samples_of(lr, hr, alignment):
         lows.append(encode_radiance(low, exposure))
@@ -137,12 +160,7 @@ def _noise_by_difference(lr: ReadableRender, hr: ReadableRender, alignment: Alig
     # All colours count alike: blue noise is hardly seen in luminance.
     squares = [np.square(low - high, dtype=np.float64).mean(axis=-1) for low, high in zip(lows, highs, strict=True)]
     deviations = gain * np.sqrt(np.concatenate([_blocks_of(plane) for plane in squares]).mean(axis=1))
-    return _of_smooth_blocks(deviations[deviations > 0])  # where both are black there is no noise
-
-
-def _of_smooth_blocks(deviations: NDArray[np.float64]) -> float:
-    """Return the deviation in blocks (n) without texture; infinite without blocks."""
-    return float(np.quantile(deviations, SMOOTH)) if len(deviations) else np.inf
+    return deviations[deviations > 0]  # where both are black there is no noise
 
 
 def has_clean_aovs(hr: ReadableRender, alignment: Alignment, least: float = CLEAN_AOVS) -> bool:
@@ -198,12 +216,12 @@ def _noise_in(blocks: Array) -> NDArray[np.float64]:
     return np.asarray(residual[residual.var(axis=(1, 2)) > 1e-8])
 
 
-def _correlations_in(residual: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the correlation (n) of neighbouring pixels in each block (n, BLOCK, BLOCK) of :func:`_noise_in`."""
-    across = (residual[:, :, 1:] * residual[:, :, :-1]).mean(axis=(1, 2))
-    down = (residual[:, 1:] * residual[:, :-1]).mean(axis=(1, 2))
+def _correlations_in(residual: NDArray[np.float64], apart: int = 1) -> NDArray[np.float64]:
+    """Return the correlation (n) of pixels so far ``apart`` in each block (n, BLOCK, BLOCK) of :func:`_noise_in`."""
+    across = (residual[:, :, apart:] * residual[:, :, :-apart]).mean(axis=(1, 2))
+    down = (residual[:, apart:] * residual[:, :-apart]).mean(axis=(1, 2))
     result: NDArray[np.float64] = (across + down) / 2 / np.square(residual).mean(axis=(1, 2))
-    return result - _neighbours_of_white_noise()
+    return result - _in_white_noise(apart)
 
 
 @functools.cache
@@ -215,9 +233,9 @@ def _without_course() -> NDArray[np.float64]:
 
 
 @functools.cache
-def _neighbours_of_white_noise() -> float:
-    """Return the correlation that independent neighbours get when the polynomial is removed."""
+def _in_white_noise(apart: int) -> float:
+    """Return the correlation that independent pixels get when the polynomial is removed."""
     covariance = _without_course().reshape((BLOCK,) * 4)
-    i = np.arange(BLOCK - 1)
-    across = np.mean([covariance[y, i, y, i + 1] for y in range(BLOCK)])  # down, they are alike
+    i = np.arange(BLOCK - apart)
+    across = np.mean([covariance[y, i, y, i + apart] for y in range(BLOCK)])  # down, they are alike
     return float(across / np.diag(_without_course()).mean())

@@ -85,12 +85,28 @@ def test_fine_texture_of_a_pair_is_no_noise(scale, noise, little):
     assert not has_little_noise(hr, hr, align(hr, hr))
 
 
-@pytest.mark.parametrize(("light", "ending"), [(0.2, "-spread"), (0.06, ""), (0.02, "-clean")])
+def grey(*parts):
+    """A render of light 1 with noise of these deviations, each spread by a filter of so many pixels."""
+    rng = np.random.default_rng(2)
+    light = 1 + sum(spread(rng.normal(0, deviation, (SIZE, SIZE, 1)), sigma) for deviation, sigma in parts)
+    return Render.from_arrays(rgb=np.repeat(light, 3, axis=-1).astype(np.float32))
+
+
 @pytest.mark.parametrize("family", ["joint", "joint-large"])
-def test_models_for_spread_noise_are_not_taken_for_one_render_with_less_of_it(family, light, ending):
-    """They would take detail for noise."""
-    noise = np.random.default_rng(2).normal(1, light, (SIZE, SIZE, 1))
-    hr = Render.from_arrays(rgb=spread(np.repeat(noise, 3, axis=-1).astype(np.float32), 0.6))
+@pytest.mark.parametrize(
+    ("parts", "ending"),
+    [
+        ([(0.2, 0.6)], "-spread"),
+        ([(0.6, 1.5)], "-spread"),
+        ([(0.06, 0.6)], ""),
+        ([(0.02, 0.6)], "-clean"),
+        ([(0.1, 0.6), (0.6, 3)], ""),
+        ([(0.1, 0.6), (1, 2.5)], "-clean"),
+    ],
+)
+def test_models_for_spread_noise_are_not_taken_for_one_render_with_less_of_it(family, parts, ending):
+    """They take detail for noise. Wide filters are no texture, which is alike over more pixels."""
+    hr = grey(*parts)
     alignment = align(hr, hr)
     assert is_noise_spread(hr, hr, alignment)
     assert family_for_noise(family, hr, hr, alignment) == (family + ending, ending)

@@ -138,7 +138,8 @@ def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, tu
     sessions = {
         family: load_model(scale, family_for_noise(family, lr, hr, alignment)[0]) for family in (BALANCED, BEST)
     }
-    sessions[BEST].layer_session()
+    if sessions[BEST].layers:
+        sessions[BEST].layer_session()
     return {model: (fuse(lr, hr, session, clean_aovs=True), session) for model, session in sessions.items()}
 
 

@@ -88,11 +88,11 @@ def write_settled(frame: ShotFrame, existing: ExistingResults) -> None:
     try:
         report.warnings += write_fused(report.output, contents, overwrite=overwrite, before_rename=finish_preview)
     except BaseException:
-        if finish_preview is not preview:  # otherwise it may not have begun
+        if finish_preview is not preview:  # with one thread, it may not have begun
             with suppress(Exception):
                 finish_preview()
-        # If the old frame is there, or another run has put one there in the meantime, the preview belongs to it.
-        if report.preview is not None and not report.output.exists():
+        # What was there before stays. If another run has put a frame there in the meantime, the preview belongs to it.
+        if report.preview is not None and not replaces and not report.output.exists():
             report.preview.unlink(missing_ok=True)
         raise
     frame.picture = None

@@ -361,6 +361,8 @@ def test_a_frame_that_stays_keeps_its_preview(tmp_path, bilinear_models, monkeyp
     assert run(folder, bilinear_models[4], previews=True, overwrite=True).results[1001].message == "disk full"
     assert contents(folder / "out") == before
     (folder / "out/beauty.1001.exr").unlink()
+    assert run(folder, bilinear_models[4], previews=True, overwrite=True).results[1001].message == "disk full"
+    assert (folder / "out/beauty.1001.png").exists()
     assert run(folder, bilinear_models[4], previews=True, skip_existing=True).results[1001].message == "disk full"
     assert contents(folder / "out") == {}
     monkeypatch.setattr(write, "write_fused", too_late)

@@ -226,7 +226,10 @@ def _window_sums(values: NDArray[Any], size: int) -> NDArray[Any]:
 
 
 def means_around(plane: Array, reach: int) -> Array:
-    """Return the mean of the pixels up to ``reach`` rows and columns away (h, w); none lie beyond the edge."""
+    """Return the mean of the pixels up to ``reach`` rows and columns away, (h, w).
+
+    Pixels beyond the edge do not count.
+    """
     height, width = plane.shape
     result = np.empty((height, width), np.float32)
 

@@ -15,8 +15,8 @@ from oiio_msspl.fusion.checks.noise import (
     CLEAN_AOVS,
     CLEAN_AOVS_OF_PAIR,
     has_clean_aovs,
-    has_less_spread_noise,
     has_little_noise,
+    has_little_spread_noise,
     is_noise_spread,
 )
 from oiio_msspl.fusion.neighbours.renders import RenderPair
@@ -145,11 +145,11 @@ def family_for_noise(
     denoises them before.
     """
     spread, scale = is_noise_spread(lr, hr, alignment), alignment.scale
-    less = spread and scale == ONE_SIZE and has_less_spread_noise(lr, hr, alignment)
+    little, less = has_little_spread_noise(lr, hr, alignment) if spread else (False, False)
     kind = SPREAD if spread and not less else ""
     clean = None if error else for_little_noise(family + kind, scale)
     denoises_aovs = family == QUALITIES["best"]
-    if clean and has_little_noise(lr, hr, alignment, spread=bool(spread), denoises_aovs=denoises_aovs):
+    if clean and (little if spread else has_little_noise(lr, hr, alignment, denoises_aovs=denoises_aovs)):
         least = CLEAN_AOVS if scale == ONE_SIZE else CLEAN_AOVS_OF_PAIR
         if spread or (denoises_aovs and scale == ONE_SIZE) or has_clean_aovs(hr, alignment, least):
             return clean, kind + CLEAN

@@ -55,7 +55,7 @@ LITTLE_OF_MEAN = 0.075
 #: The limits for noise that a filter has spread, by scale: of its deviation, and of the correlation of pixels two
 #: apart, which is higher where texture outweighs noise. Renders of one size reach these at some 500 to 1,000 spp.
 LITTLE_SPREAD = {1: (0.0055, 0.075), 2: (0.018, 0.03), 4: (0.036, 0.03), 8: (0.072, 0.03)}
-#: The limits from which on renders of one size gain by models for independent noise: at some 100 to 300 spp.
+#: The limits at which renders of one size begin to gain by models for independent noise: at some 100 to 300 spp.
 LESS_SPREAD = 0.009, 0.03
 #: Pixels three apart correlate by less than this in noise of filters that are so wide that those two apart do not tell.
 WIDE = -0.2
@@ -92,42 +92,41 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
 
 
 def has_little_noise(
-    lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, spread: bool = False, denoises_aovs: bool = False
+    lr: ReadableRender, hr: ReadableRender, alignment: Alignment, *, denoises_aovs: bool = False
 ) -> bool:
     """Return whether an HRLS has little noise, or the mean of two renders of one size; one render is given as both.
 
     Small samples all over the frame are read.
 
     Args:
-        lr, hr, alignment: of the pair.
-        spread: a filter has spread the noise over neighbouring pixels.
+        lr, hr, alignment: of the pair, whose noise no filter has spread.
         denoises_aovs: the model for little noise denoises albedo and normal before. Then it gains in more noise of the
             HRLS, too, if the LRHS has much less.
     """
-    scale = alignment.scale
-    if spread:
-        return has_less_spread_noise(lr, hr, alignment, LITTLE_SPREAD[scale])
-    if scale == ONE_SIZE:
+    if alignment.scale == ONE_SIZE:
         limit = LITTLE_WITH_CLEAN_AOVS if denoises_aovs else LITTLE
         found = _residuals(lr, hr, alignment).std(axis=(1, 2))
     else:
-        limit = LITTLE_OF_MEAN if denoises_aovs else LITTLE_OF_PAIR[scale]
+        limit = LITTLE_OF_MEAN if denoises_aovs else LITTLE_OF_PAIR[alignment.scale]
         found = _noise_by_difference(lr, hr, alignment, of_mean=denoises_aovs)
     return _in_smooth_blocks(found) < limit
 
 
-def has_less_spread_noise(
-    lr: ReadableRender, hr: ReadableRender, alignment: Alignment, limits: tuple[float, float] = LESS_SPREAD
-) -> bool:
-    """Return whether there is so little spread noise that models for it, trained on more, take detail for noise.
+def has_little_spread_noise(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> tuple[bool, bool]:
+    """Return whether a filter has spread little noise, and whether models for independent noise are more accurate then.
 
-    ``limits``: of the noise's deviation, and of the correlation of pixels two apart. These do not correlate in noise
-    that a filter has spread, and do in texture.
+    Models for spread noise were trained with more of it, and take detail for noise. The second is False for renders of
+    two sizes. Small samples all over the frame are read.
     """
     residuals = _residuals(lr, hr, alignment)
+    deviation = _in_smooth_blocks(residuals.std(axis=(1, 2)))
+    # Pixels two apart do not correlate in noise that a filter has spread, and do in texture.
     two_apart, three_apart = (np.median(_correlations_in(residuals, apart)) for apart in (2, 3))
-    is_textured = two_apart > limits[1] and three_apart > WIDE
-    return bool(is_textured or _in_smooth_blocks(residuals.std(axis=(1, 2))) < limits[0])
+    texture = two_apart if three_apart > WIDE else 0.0
+    little, less = (
+        bool(deviation < most or texture > least) for most, least in (LITTLE_SPREAD[alignment.scale], LESS_SPREAD)
+    )
+    return little, less and alignment.scale == ONE_SIZE
 
 
 def _residuals(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> NDArray[np.float64]:

@@ -63,7 +63,8 @@ def blank(
     if has_many_pixels(*shape[:2]) if on_disk is None else on_disk:
         with tempfile.TemporaryFile(prefix="msspl-") as file:
             reserve(file, math.prod(shape) * np.dtype(dtype).itemsize)
-            image: NDArray[T] = np.memmap(file, dtype, "r+", shape=stored)
+            # As an array like any other: NumPy takes longer for its parts otherwise.
+            image: NDArray[T] = np.asarray(np.memmap(file, dtype, "r+", shape=stored))
     else:
         image = np.zeros(stored, dtype)
     return np.moveaxis(image, (-2, -1), (0, 1)) if channels_first else image
@@ -89,7 +90,7 @@ def reserve(file: IO[bytes], size: int) -> None:
 
 def kept(values: NDArray[T], *, on_disk: bool | None = None) -> NDArray[T]:
     """Return an image that waits for other images: itself, or a copy in a file if :func:`blank` would use one."""
-    if not (has_many_pixels(*values.shape[:2]) if on_disk is None else on_disk) or _file_of(values) is not None:
+    if not (has_many_pixels(*values.shape[:2]) if on_disk is None else on_disk) or file_of(values) is not None:
         return values
     copy = blank(values.shape, values.dtype, on_disk=True, interleaved=values.strides[-1] == values.itemsize)
     copy[:] = values
@@ -99,12 +100,12 @@ def kept(values: NDArray[T], *, on_disk: bool | None = None) -> NDArray[T]:
 
 def unload(values: NDArray[Any]) -> None:
     """Give the memory of an image in a temporary file back to the system; an image in memory is left alone."""
-    file = _file_of(values)
+    file = file_of(values)
     if file is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
         file.madvise(mmap.MADV_DONTNEED)
 
 
-def _file_of(values: NDArray[Any]) -> mmap.mmap | None:
+def file_of(values: NDArray[Any]) -> mmap.mmap | None:
     """Return the temporary file of an image, or of the image that it is a part of; None if it is in memory."""
     owner = values.base
     while isinstance(owner, np.ndarray):
@@ -157,3 +158,8 @@ def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bo
 def planes_of(image: Array) -> Array:
     """Return an image (h, w, c) as contiguous planes (c, h, w)."""
     return np.ascontiguousarray(np.moveaxis(image, -1, 0))
+
+
+def in_planes(image: Array) -> Array:
+    """Return an image (h, w, c) with channels that are contiguous in memory."""
+    return np.moveaxis(planes_of(image), 0, -1)

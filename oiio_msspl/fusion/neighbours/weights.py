@@ -20,8 +20,7 @@ class WeightedSum:
     """
 
     def __init__(self, images: dict[str, Array]) -> None:
-        # NumPy takes longer for a part of an image in a temporary file than for one of any other.
-        self._images = {name: np.asarray(image) for name, image in images.items()}
+        self._images = images
         height, width = next(iter(images.values())).shape[:2]
         self._weights: Array = np.ones((height, width), np.float32)
         self._squares = np.ones_like(self._weights)

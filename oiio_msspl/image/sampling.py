@@ -36,6 +36,34 @@ def _nearest(positions: Array, side: int) -> NDArray[np.int32]:
     return nearest.astype(np.int32)  # four times as fast as to 64 bits
 
 
+def sample_linear(image: Array, x: Array, y: Array) -> Array:
+    """Interpolate an image (h, w, c) linearly at pixel positions (...); its edge is repeated outside.
+
+    Images whose channels are contiguous in memory are not copied.
+
+    Returns:
+        (..., c), with channels that are contiguous in memory.
+    """
+    height, width, channels = image.shape
+    x, y = (np.clip(at, 0, side - 1, dtype=np.float32) for at, side in ((x, width), (y, height)))
+    left, top = np.floor(x), np.floor(y)
+    right, down = x - left, y - top
+    corner = top.astype(np.int32) * np.intp(width) + left.astype(np.int32)  # four times as fast as to 64 bits
+    beside, below = (left < width - 1).astype(np.intp), np.where(top < height - 1, np.intp(width), np.intp(0))
+    corners = corner, corner + beside, corner + below, corner + below + beside
+    result = np.empty((channels, *x.shape), np.float32)
+    other, low, low_other = np.empty((3, *x.shape), np.float32)
+    for plane, out in zip(np.moveaxis(image, -1, 0).reshape(channels, -1), result, strict=True):
+        # "wrap" makes NumPy write straight into the result. No index is outside.
+        for indices, pixels in zip(corners, (out, other, low, low_other), strict=True):
+            plane.take(indices, out=pixels, mode="wrap")
+        for start, end, share in ((out, other, right), (low, low_other, right), (out, low, down)):
+            end -= start
+            end *= share
+            start += end
+    return np.moveaxis(result, 0, -1)
+
+
 def sample_cubic(
     images: Sequence[Array],
     positions: Callable[[slice], tuple[Array, Array]],

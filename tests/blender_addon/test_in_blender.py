@@ -16,9 +16,9 @@ from msspl_cli.commands.nuke_install import find_msspl_fuse
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.motion import source as motion
-from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.colour import ACESCG, REC709, conversion
+from oiio_msspl.image.sampling import sample_linear
 from tests.blender_addon.conftest import posix, render_command
 from tests.conftest import EXAMPLES
 

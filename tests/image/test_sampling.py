@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl.image import sampling
-from oiio_msspl.image.sampling import nearest_indices, sample_cubic
+from oiio_msspl.image.sampling import nearest_indices, sample_cubic, sample_linear
 
 HEIGHT, WIDTH = 40, 60
 
@@ -13,6 +13,16 @@ HEIGHT, WIDTH = 40, 60
 def sample(monkeypatch, most_chosen, images, x, y, valid=True):
     monkeypatch.setattr(sampling, "MOST_CHOSEN", most_chosen)
     return sample_cubic(images, lambda rows: (x[rows], y[rows]), x.shape, np.broadcast_to(valid, x.shape))
+
+
+@pytest.mark.parametrize("layout", ["C", "F"])
+def test_a_linear_sample_lies_between_four_pixels_and_repeats_the_edge(layout):
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    image = np.asarray(np.stack([x, 2 * y, 3 * x + y], axis=-1), order=layout)
+    at_x, at_y = np.float32([[0.25, 58.5, -4], [7, 99, 59]]), np.float32([[3.5, 38.75, 2], [39, 0.5, 1e6]])
+    inside_x, inside_y = np.clip(at_x, 0, WIDTH - 1), np.clip(at_y, 0, HEIGHT - 1)
+    expected = np.stack([inside_x, 2 * inside_y, 3 * inside_x + inside_y], axis=-1)
+    assert np.allclose(sample_linear(image, at_x, at_y), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("moving", [0, 0.1, 0.5, 1])

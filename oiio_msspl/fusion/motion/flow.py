@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.sampling import sample_linear
 
 #: A vector is believed if the way there and back ends this close to its pixel, in pixels.
 FLOW_ERROR = 0.75

@@ -15,8 +15,8 @@ import numpy as np
 
 from oiio_msspl.aovs.motion import CHOICES, MotionField, MotionFormat
 from oiio_msspl.fusion.motion.guides import POSITION, Guide, TwoFrames
-from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.sampling import sample_linear
 
 #: The best format must fit this many times as well as no motion, and as the runner-up.
 MARGIN = 1.5

@@ -17,7 +17,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
-from oiio_msspl.image.arrays import Array, Mask, finite
+from oiio_msspl.image.arrays import Array, Mask, finite, in_planes
 from oiio_msspl.image.filters import box_downsample, sum_3x3
 from oiio_msspl.image.parallel import in_parallel
 
@@ -96,10 +96,10 @@ def open_frames(first: MappedRender, second: MappedRender, rows: int | None = No
         if names:  # averaged over 3 x 3 pixels, which lowers the noise of few samples
             values = sum_3x3(reduced(read, window, reduction)) / np.float32(9)
             parts = np.split(values, len(names), axis=-1)
-            features = {name: np.ascontiguousarray(part) for name, part in zip(names, parts, strict=True)}
+            features = dict(zip(names, parts, strict=True))
         if with_position and render.motion.position:
             features[POSITION] = reduced(partial(render.file.read, render.motion.position), window, reduction)
-        return features
+        return {name: in_planes(image) for name, image in features.items()}
 
     of_first, of_second = in_parallel(*(partial(images, render) for render in renders))
     guides = tuple(Guide(name, (image, of_second[name])) for name, image in of_first.items())

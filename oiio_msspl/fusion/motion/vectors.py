@@ -15,10 +15,10 @@ from oiio_msspl.aovs.mapped_render import MappedRender, ReadableRender
 from oiio_msspl.aovs.motion import MotionFormat
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
-from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.arrays import Array, Mask, in_planes
 from oiio_msspl.image.filters import max_around
 from oiio_msspl.image.parallel import for_row_blocks
-from oiio_msspl.image.sampling import nearest_indices
+from oiio_msspl.image.sampling import nearest_indices, sample_linear
 
 #: Shorter vectors are no movement, in pixels.
 NO_MOTION = 1e-3
@@ -137,13 +137,15 @@ def invert(own: Array, other: Array, other_known: Mask, window: Window, other_wi
     known = np.zeros((height, width), np.bool_)
     shift_x, shift_y = window.x0 - other_window.x0, window.y0 - other_window.y0
 
+    field = in_planes(other)  # is read in every block
+
     def work(rows: slice) -> None:
         y, x = np.mgrid[rows.start : rows.stop, 0:width].astype(np.float32)
-        way = -own[rows]
+        way = -in_planes(own[rows])
         for _ in range(INVERSION_ROUNDS):
-            way = -sample_linear(other, x + way[..., 0] + shift_x, y + way[..., 1] + shift_y)
+            way = -sample_linear(field, x + way[..., 0] + shift_x, y + way[..., 1] + shift_y)
         at_x, at_y = x + way[..., 0] + shift_x, y + way[..., 1] + shift_y
-        back = sample_linear(other, at_x, at_y) + way
+        back = sample_linear(field, at_x, at_y) + way
         vectors[rows] = way
         inside = (at_x >= -0.5) & (at_y >= -0.5) & (at_x <= other.shape[1] - 0.5) & (at_y <= other.shape[0] - 0.5)
         returns = np.hypot(back[..., 0], back[..., 1]) < INVERSION_ERROR
@@ -179,21 +181,3 @@ def near_borders(vectors: Array, tolerance: float) -> Mask:
 def as_complex(vectors: Array) -> NDArray[np.complex64]:
     """Return vectors (h, w, 2) as complex numbers (h, w), which NumPy gathers and subtracts in half the time."""
     return np.ascontiguousarray(vectors, np.float32).view(np.complex64)[..., 0]
-
-
-def sample_linear(image: Array, x: Array, y: Array) -> Array:
-    """Interpolate an image (h, w, c) linearly at pixel positions; its edge is repeated outside."""
-    height, width, channels = image.shape
-    pixels = np.ascontiguousarray(image).reshape(-1, channels)
-    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
-    left, top = x.astype(np.int32), y.astype(np.int32)
-    u, v = (x - left)[..., None], (y - top)[..., None]
-    corner = top * width + left
-    right, down = (left < width - 1).astype(np.int32), np.where(top < height - 1, np.int32(width), np.int32(0))
-    result = pixels.take(corner, 0)
-    result += (pixels.take(corner + right, 0) - result) * u
-    corner += down
-    below = pixels.take(corner, 0)
-    below += (pixels.take(corner + right, 0) - below) * u
-    result += (below - result) * v
-    return result

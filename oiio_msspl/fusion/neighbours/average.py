@@ -18,7 +18,6 @@ from oiio_msspl.aovs.features import RGB, VARIANCE
 from oiio_msspl.aovs.mapped_render import ReadableRender
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.fusion.neighbours.bands import for_bands, rows_in_bands, whole_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
 from oiio_msspl.fusion.neighbours.renders import SQUARES, USUAL_CHANNELS, Features, RenderBand, RenderPair, read
@@ -26,6 +25,7 @@ from oiio_msspl.fusion.neighbours.results import Images, ResultBand, images_of
 from oiio_msspl.fusion.neighbours.trust import WHOLE, Judge, Light, RenderLight, ResultLight, cells
 from oiio_msspl.image.arrays import Array, blank, unload
 from oiio_msspl.image.parallel import two_at_a_time
+from oiio_msspl.image.sampling import sample_linear
 
 #: Bytes for each pixel of the rows that are averaged at a time: of renders without their features, and of results.
 BYTES_OF_RENDERS, BYTES_OF_RESULTS = 56, 96

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.fusion.passes.bands import Band, PassSources, dimmed, estimated_of, in_both
 from oiio_msspl.fusion.passes.lines import downsampled
 from oiio_msspl.fusion.passes.plan import PassJob
@@ -20,6 +19,7 @@ from oiio_msspl.fusion.tiles.features import in_hrls_pixels, read_features, read
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.filters import blurred, box_downsample, filled, max_around, upsample_linear
 from oiio_msspl.image.parallel import for_row_blocks
+from oiio_msspl.image.sampling import sample_linear
 
 #: HRLS pixels on a side of the squares over which the shares of layers are averaged.
 SQUARE = 64

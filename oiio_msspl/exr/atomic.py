@@ -88,10 +88,10 @@ def check_folder(path: Path, *, writable: bool = True) -> None:
         raise InputError(f"{path}: the folder {folder} is not writable")
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder if it does not exist, or raise InputError."""
+def make_folder(folder: Path, *, new: bool = False) -> None:
+    """Make a folder if it does not exist, or raise InputError, also if it exists but has to be ``new``."""
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(exist_ok=not new)
     except OSError as error:
         raise InputError(f"{folder}: the folder can't be made ({error.strerror})") from error
 

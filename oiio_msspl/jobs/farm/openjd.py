@@ -253,7 +253,7 @@ def write_bundle(folder: Path, job: Job) -> None:
     check_folder(folder)
     if folder.exists():
         raise InputError(f"{folder}: exists; name a new folder for the bundle")
-    make_folder(folder)
+    make_folder(folder, new=True)  # another submission may make it now
     for_deadline = {"parameterValues": [{"name": name, "value": value} for name, value in job.values.items()]}
     try:
         for name, content in ((VALUES, for_deadline), (OPENJD_VALUES, job.values), (TEMPLATE, job.template)):

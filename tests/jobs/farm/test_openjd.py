@@ -236,6 +236,16 @@ def test_a_canceled_job_ends_with_whole_frames(tmp_path, bilinear_models):
     assert 3 <= len(files) < 100
 
 
+def test_a_bundle_takes_no_folder_that_another_one_makes_meanwhile(tmp_path, monkeypatch):
+    monkeypatch.setattr(bundles, "check_folder", lambda folder: None)
+    monkeypatch.setattr(Path, "exists", lambda path: False)
+    (tmp_path / "job").mkdir()
+    (tmp_path / "job/mine").touch()
+    with pytest.raises(InputError, match="can't be made"):
+        bundles.write_bundle(tmp_path / "job", bundles.Job(None, {}, {}))
+    assert [path.name for path in (tmp_path / "job").iterdir()] == ["mine"]
+
+
 def test_a_bundle_that_cannot_be_completed_leaves_no_folder(tmp_path, monkeypatch):
     def full(*_, **__):
         raise MssplError("the disk is full")

@@ -63,7 +63,7 @@ def blank(
     if has_many_pixels(*shape[:2]) if on_disk is None else on_disk:
         with tempfile.TemporaryFile(prefix="msspl-") as file:
             reserve(file, math.prod(shape) * np.dtype(dtype).itemsize)
-            # As an array like any other: NumPy takes longer for its parts otherwise.
+            # NumPy takes longer for parts of a memmap than for those of a plain array.
             image: NDArray[T] = np.asarray(np.memmap(file, dtype, "r+", shape=stored))
     else:
         image = np.zeros(stored, dtype)
